@@ -1,0 +1,6 @@
+"""A differentiable multi-fragment compositor."""
+
+from warpfrag.fragments import Fragments, Layers
+from warpfrag.resolve.smooth import resolve
+
+__all__ = ["Fragments", "Layers", "resolve"]

@@ -1,0 +1,1 @@
+"""Array kinds in and out, autograd and tape recording, parallel kernel launches."""

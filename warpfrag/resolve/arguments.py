@@ -1,0 +1,221 @@
+"""What resolving and compositing take in common: their options, beta, and checks of values."""
+
+import math
+from collections.abc import Sequence
+from typing import Any, Literal, get_args
+
+import numpy as np
+import warp as wp
+
+from warpfrag.fragments import Fragments
+from warpfrag.interop.launch import Span, launch, worker_count
+from warpfrag.interop.operator import dtype_name, kind_of
+from warpfrag.operators import LOG_FLOOR, LOG_OPAQUE, MIX_AVERAGE, MIX_OPACITY, MIX_OPTICAL_DEPTH, Slab32, Slab64
+from warpfrag.resolve.walk import MERGE_NONE, MERGE_ORDER_INDEPENDENT, MERGE_SMOOTH, NO_FRAGMENT
+
+Merge = Literal["none", "smooth", "order_independent"]
+Mix = Literal["opacity", "average", "optical_depth"]
+
+MERGES = {"none": MERGE_NONE, "smooth": MERGE_SMOOTH, "order_independent": MERGE_ORDER_INDEPENDENT}
+MIXES = {"opacity": MIX_OPACITY, "average": MIX_AVERAGE, "optical_depth": MIX_OPTICAL_DEPTH}
+
+# Tensors and options that operators on fragments share, in this order.
+FRAGMENT_TENSORS = ("rgba", "depth", "thickness", "offsets", "beta", "opacity_sum")
+FRAGMENT_DIFFERENTIABLE = ("rgba", "depth", "thickness", "beta", "opacity_sum")
+MERGE_OPTIONS = {"max_layers": "int", "merge": "str", "mix": "str"}
+
+
+def check_options(merge: str, mix: str, max_layers: int) -> None:
+    """Raise for a merge, mix or layer number that does not exist."""
+    check_choice("merge", merge, get_args(Merge))
+    check_choice("mix", mix, get_args(Mix))
+    if isinstance(max_layers, bool) or not isinstance(max_layers, (int, np.integer)):
+        raise TypeError(f"max_layers: got {max_layers!r}, expected a whole number of at least 1")
+    if max_layers < 1:
+        raise ValueError(f"max_layers: got {max_layers}, expected at least 1")
+
+
+def check_choice(name: str, value: Any, choices: Sequence[str]) -> None:
+    """Raise unless `value` is one of `choices`."""
+    if value not in choices:
+        raise ValueError(f"{name}: got {value!r}, expected one of {', '.join(map(repr, choices))}")
+
+
+def fragment_inputs(fragments: Fragments, beta: Any) -> tuple[Any, ...]:
+    """Return the operator inputs `FRAGMENT_TENSORS`."""
+    if not isinstance(fragments, Fragments):
+        raise TypeError(f"fragments: got {type(fragments).__name__}, expected Fragments")
+    return (
+        fragments.rgba,
+        fragments.depth,
+        fragments.thickness,
+        as_int32(fragments.offsets),
+        beta_array(beta, fragments.rgba, fragments.shape),
+        fragments.opacity_sum,
+    )
+
+
+def as_int32(array: Any) -> Any:
+    """Return an index array as int32, itself if it is so already."""
+    if dtype_name(array) == "int32":
+        return array
+    kind = kind_of(array)
+    if kind == "numpy":
+        return array.astype(np.int32)
+    if kind == "torch":
+        return array.int()
+    return wp.array(array.numpy().astype(np.int32), device=array.device)
+
+
+def beta_array(beta: Any, like: Any, shape: tuple[int, ...]) -> Any:
+    """Return beta as an array of one entry, or of one per pixel, of the kind and precision of `like`."""
+    kind = kind_of(like)
+    if kind_of(beta) is None:
+        if isinstance(beta, bool) or not isinstance(beta, (int, float, np.floating, np.integer)):
+            raise TypeError(f"beta: got {type(beta).__name__}, expected a number or an array, 0-d or of shape {shape}")
+        if not 0.0 <= beta <= 1.0:
+            raise ValueError(f"beta: got {beta}, expected a number from 0 to 1")
+        if kind == "torch":
+            return like.new_full((1,), float(beta))
+        values = np.full(1, beta, dtype_name(like))
+        return values if kind == "numpy" else wp.array(values, device=like.device)
+    if kind_of(beta) != kind:
+        raise TypeError(f"beta: got a {kind_of(beta)} array, expected a {kind} array like the fragments, or a number")
+    if dtype_name(beta) != dtype_name(like):
+        raise TypeError(f"beta: got dtype {dtype_name(beta)}, expected {dtype_name(like)} like the fragments")
+    if kind != "numpy" and beta.device != like.device:
+        raise ValueError(f"beta: is on {beta.device}, expected {like.device} like the fragments")
+    if tuple(beta.shape) not in ((), (1,), tuple(shape)):
+        raise ValueError(f"beta: got shape {tuple(beta.shape)}, expected () or {tuple(shape)}")
+    return beta.reshape((math.prod(beta.shape),))
+
+
+def slab_type(scalar: Any) -> Any:
+    """Return the slab structure of a precision."""
+    return Slab32 if scalar is wp.float32 else Slab64
+
+
+class Walk:
+    """One launch of a kernel that walks through every pixel's fragments, and the memory it needs.
+
+    Scratch memory has a row for each thread that runs at the same time, as long as the longest list of fragments.
+    """
+
+    def __init__(self, inputs: Sequence[wp.array | None], max_layers: int, merge: str, mix: str):
+        """Take the operator's inputs `FRAGMENT_TENSORS` and options `MERGE_OPTIONS`."""
+        rgba, depth, thickness, offsets, beta, opacity_sum = inputs
+        self.inputs = inputs
+        self.scalar = rgba.dtype
+        self.device = rgba.device
+        self.pixel_count = offsets.shape[0] - 1
+        self.length = max(1, longest_list(offsets, rgba.shape[0]))
+        self.arguments = [
+            *(rgba, depth, thickness, offsets, beta, self.optional(opacity_sum, 1)),
+            *(max_layers, MERGES[merge], MIXES[mix]),
+            self.scalar(LOG_OPAQUE if mix == "optical_depth" else LOG_FLOOR),
+        ]
+
+    def optional(self, array: wp.array | None, ndim: int) -> wp.array:
+        """Return the array, or an empty one in place of None: kernels skip those."""
+        return array if array is not None else wp.empty((0,) * ndim, dtype=self.scalar, device=self.device)
+
+    def scratch(self, rows: int, dtype: Any) -> wp.array:
+        """Return scratch memory, one value per thread and fragment of a pixel."""
+        return wp.empty((rows, self.length), dtype=dtype, device=self.device)
+
+    def forward(self, kernel: wp.Kernel, outputs: Sequence[wp.array]) -> None:
+        """Run a kernel that takes the arguments, `order`, `invalid` and the outputs; raise if it finds invalid values."""
+        rows = worker_count(self.pixel_count, self.device, 4 * self.length)
+        invalid = wp.array(np.full((rows, 2), NO_FRAGMENT, np.int32), device=self.device)
+        launch(
+            kernel,
+            self.pixel_count,
+            [*self.arguments, self.scratch(rows, wp.int32), invalid, *outputs],
+            self.device,
+            rows,
+        )
+        report_invalid(invalid, self.inputs)
+
+    def backward(self, kernel: wp.Kernel, grads: Sequence[wp.array], grad_inputs: Sequence[wp.array | None]) -> None:
+        """Run a kernel that takes the arguments, `order`, `states`, `steps`, the output and the input gradients."""
+        slab = slab_type(self.scalar)
+        rows = worker_count(self.pixel_count, self.device, (8 + wp._src.types.type_size_in_bytes(slab)) * self.length)
+        grad_rgba, grad_depth, grad_thickness, _, grad_beta, grad_opacity_sum = grad_inputs
+        beta_pixels = None
+        if grad_beta is not None:
+            beta_pixels = wp.empty(self.pixel_count, dtype=self.scalar, device=self.device)
+        targets = [
+            self.optional(array, ndim)
+            for array, ndim in (
+                *((grad_rgba, 2), (grad_depth, 1), (grad_thickness, 1), (beta_pixels, 1), (grad_opacity_sum, 1)),
+            )
+        ]
+        scratch = [self.scratch(rows, dtype) for dtype in (wp.int32, slab, wp.int32)]
+        launch(kernel, self.pixel_count, [*self.arguments, *scratch, *grads, *targets], self.device, rows)
+        if grad_beta is not None:
+            sum_beta(beta_pixels, grad_beta)
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def list_extent(span: Span, offsets: wp.array[int], fragment_count: int, extent: wp.array2d[int]):
+    """Find the longest list; a list that ends before it begins or beyond the fragments is reported by its pixel."""
+    for pixel in range(span.begin + wp.tid(), span.end, span.stride):
+        begin = offsets[pixel]
+        end = offsets[pixel + 1]
+        if begin < 0 or end < begin or end > fragment_count:
+            wp.atomic_min(extent, span.worker, 1, pixel)
+        else:
+            wp.atomic_max(extent, span.worker, 0, end - begin)
+
+
+def longest_list(offsets: wp.array, fragment_count: int) -> int:
+    """Return the largest number of fragments in a pixel.
+
+    Raises:
+        ValueError: the offsets do not run from 0 to the number of fragments without stepping back.
+    """
+    pixel_count = offsets.shape[0] - 1
+    device = offsets.device
+    rows = worker_count(pixel_count, device, 0) if device.is_cpu else 1
+    extent = wp.array(np.tile(np.array([0, NO_FRAGMENT], np.int32), (rows, 1)), device=device)
+    launch(list_extent, pixel_count, [offsets, fragment_count, extent], device)
+    found = extent.numpy()
+    pixel = found[:, 1].min()
+    if pixel != NO_FRAGMENT:
+        begin, end = offsets[pixel : pixel + 2].numpy()
+        raise ValueError(
+            f"offsets: pixel {pixel} has the fragments {begin} : {end}, expected 0 <= begin <= end <= {fragment_count}"
+        )
+    first, last = (offsets[at : at + 1].numpy()[0] for at in (0, pixel_count))
+    if first != 0 or last != fragment_count:
+        raise ValueError(f"offsets: run from {first} to {last}, expected from 0 to the {fragment_count} fragments")
+    return int(found[:, 0].max())
+
+
+def report_invalid(invalid: wp.array, inputs: Sequence[wp.array | None]) -> None:
+    """Raise for the first fragment or pixel that a kernel found to have values out of range.
+
+    Args:
+        invalid: one row per thread: lowest invalid fragment, lowest pixel with an invalid beta.
+        inputs: the operator's inputs, as `fragment_inputs` orders them.
+    """
+    fragment, pixel = invalid.numpy().min(axis=0)
+    if fragment != NO_FRAGMENT:
+        rgba, depth, thickness = (inputs[i][fragment : fragment + 1].numpy()[0] for i in range(3))
+        raise ValueError(
+            f"fragments: fragment {fragment} has rgba {tuple(map(float, rgba))}, depth {depth}, thickness {thickness}, "
+            "expected finite values, opacity from 0 to 1 and thickness of at least 0"
+        )
+    if pixel != NO_FRAGMENT:
+        beta = inputs[4].numpy()[min(pixel, inputs[4].shape[0] - 1)]
+        raise ValueError(f"beta: got {beta} in pixel {pixel}, expected values from 0 to 1")
+
+
+def sum_beta(grad_pixels: wp.array, grad_beta: wp.array) -> None:
+    """Write the gradient of beta, given that of each pixel; the sum's order does not depend on threads."""
+    if grad_beta.shape == grad_pixels.shape:
+        wp.copy(grad_beta, grad_pixels)
+    elif grad_beta.device.is_cpu:
+        grad_beta.numpy()[0] = grad_pixels.numpy().sum(dtype=np.float64)
+    else:
+        wp.utils.array_sum(grad_pixels, out=grad_beta)

@@ -1,0 +1,289 @@
+"""The resolve pass: N fragments of a pixel become at most M layers (fragment merging, Algorithm 1).
+
+    running = fragment 0;  for each following fragment, in order of depth:
+        overlapping:             running = sfm(running, following)       (or ofm)
+        M - 1 layers not full:   put out running, running = following
+        else:                    running = over(running, following)      (tail)
+
+The gradient of a step is the operator's own vector-Jacobian product, applied in reverse order to the states that
+`resolve_bwd` recomputes. Differentiable in colour, opacity, depth, thickness, opacity sum and beta; which fragments
+merge, their order, and what falls into the tail are held fixed.
+"""
+
+from collections.abc import Sequence
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from warpfrag.fragments import Fragments, Layers
+from warpfrag.interop.launch import Span
+from warpfrag.interop.operator import Operator, apply
+from warpfrag.resolve.arguments import (
+    FRAGMENT_DIFFERENTIABLE,
+    FRAGMENT_TENSORS,
+    MERGE_OPTIONS,
+    Merge,
+    Mix,
+    Walk,
+    check_options,
+    fragment_inputs,
+    slab_type,
+)
+from warpfrag.resolve.walk import (
+    STEP_START,
+    choose_step,
+    load_slab,
+    replay,
+    sort_pixel,
+    store_grad,
+    take_step,
+    take_step_back,
+    valid_fragment,
+    zero_slab,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def store_layer(s: Any, pixel: int, layer: int, rgba: Any, depth: Any, thickness: Any, opacity_sum: Any):
+    rgba[pixel, layer, 0] = s.c[0]
+    rgba[pixel, layer, 1] = s.c[1]
+    rgba[pixel, layer, 2] = s.c[2]
+    rgba[pixel, layer, 3] = s.a
+    depth[pixel, layer] = s.z
+    thickness[pixel, layer] = s.z - s.f
+    opacity_sum[pixel, layer] = s.a * s.w
+
+
+@wp.func
+def load_layer_grad(
+    g: Any, s: Any, pixel: int, layer: int, rgba: Any, depth: Any, thickness: Any, opacity_sum: Any
+):
+    """Return the cotangent g of a layer's slab s plus what comes in through the layer's outputs; empty ones are zero."""
+    if rgba.shape[0] > 0:
+        g.c[0] = g.c[0] + rgba[pixel, layer, 0]
+        g.c[1] = g.c[1] + rgba[pixel, layer, 1]
+        g.c[2] = g.c[2] + rgba[pixel, layer, 2]
+        g.a = g.a + rgba[pixel, layer, 3]
+    if depth.shape[0] > 0:
+        g.z = g.z + depth[pixel, layer]
+    if thickness.shape[0] > 0:
+        g.z = g.z + thickness[pixel, layer]
+        g.f = g.f - thickness[pixel, layer]
+    if opacity_sum.shape[0] > 0:
+        g.a = g.a + opacity_sum[pixel, layer] * s.w
+        g.w = g.w + opacity_sum[pixel, layer] * s.a
+    return g
+
+
+@cache
+def _forward_kernel(scalar: Any) -> wp.Kernel:
+    @wp.kernel(module="unique", enable_backward=False)
+    def resolve_fwd(
+        span: Span,
+        rgba: wp.array2d(dtype=scalar),
+        depth: wp.array(dtype=scalar),
+        thickness: wp.array(dtype=scalar),
+        offsets: wp.array(dtype=int),
+        beta: wp.array(dtype=scalar),
+        opacity_sum: wp.array(dtype=scalar),
+        max_layers: int,
+        merge: int,
+        mix: int,
+        floor: scalar,
+        order: wp.array2d(dtype=int),
+        invalid: wp.array2d(dtype=int),
+        layer_rgba: wp.array3d(dtype=scalar),
+        layer_depth: wp.array2d(dtype=scalar),
+        layer_thickness: wp.array2d(dtype=scalar),
+        layer_opacity_sum: wp.array2d(dtype=scalar),
+        layer_count: wp.array(dtype=int),
+    ):
+        row = span.worker + wp.tid()
+        for pixel in range(span.begin + wp.tid(), span.end, span.stride):
+            begin = offsets[pixel]
+            end = offsets[pixel + 1]
+            pixel_beta = beta[wp.where(beta.shape[0] > 1, pixel, 0)]
+            if not (pixel_beta >= scalar(0.0) and pixel_beta <= scalar(1.0)):
+                wp.atomic_min(invalid, span.worker, 1, pixel)
+            sort_pixel(depth, thickness, begin, end, order, row)
+            running = zero_slab(scalar(0.0))
+            layer = int(0)
+            for position in range(end - begin):
+                fragment = order[row, position]
+                if not valid_fragment(rgba, depth, thickness, fragment):
+                    wp.atomic_min(invalid, span.worker, 0, fragment)
+                following = load_slab(rgba, depth, thickness, opacity_sum, fragment)
+                if position == 0:
+                    running = following
+                else:
+                    step = choose_step(running, following, layer, max_layers, merge)
+                    if step == STEP_START:
+                        store_layer(
+                            running, pixel, layer, layer_rgba, layer_depth, layer_thickness, layer_opacity_sum
+                        )
+                        running = following
+                        layer += 1
+                    else:
+                        running = take_step(step, running, following, pixel_beta, merge, mix, floor)
+            if end > begin:
+                store_layer(running, pixel, layer, layer_rgba, layer_depth, layer_thickness, layer_opacity_sum)
+                layer += 1
+            layer_count[pixel] = layer
+            for unused in range(layer, max_layers):
+                store_layer(
+                    zero_slab(scalar(0.0)),
+                    pixel,
+                    unused,
+                    layer_rgba,
+                    layer_depth,
+                    layer_thickness,
+                    layer_opacity_sum,
+                )
+
+    return resolve_fwd
+
+
+@cache
+def _backward_kernel(scalar: Any) -> wp.Kernel:
+    Slab = slab_type(scalar)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def resolve_bwd(
+        span: Span,
+        rgba: wp.array2d(dtype=scalar),
+        depth: wp.array(dtype=scalar),
+        thickness: wp.array(dtype=scalar),
+        offsets: wp.array(dtype=int),
+        beta: wp.array(dtype=scalar),
+        opacity_sum: wp.array(dtype=scalar),
+        max_layers: int,
+        merge: int,
+        mix: int,
+        floor: scalar,
+        order: wp.array2d(dtype=int),
+        states: wp.array2d(dtype=Slab),
+        steps: wp.array2d(dtype=int),
+        grad_layer_rgba: wp.array3d(dtype=scalar),
+        grad_layer_depth: wp.array2d(dtype=scalar),
+        grad_layer_thickness: wp.array2d(dtype=scalar),
+        grad_layer_opacity_sum: wp.array2d(dtype=scalar),
+        grad_rgba: wp.array2d(dtype=scalar),
+        grad_depth: wp.array(dtype=scalar),
+        grad_thickness: wp.array(dtype=scalar),
+        grad_beta: wp.array(dtype=scalar),
+        grad_opacity_sum: wp.array(dtype=scalar),
+    ):
+        row = span.worker + wp.tid()
+        for pixel in range(span.begin + wp.tid(), span.end, span.stride):
+            begin = offsets[pixel]
+            end = offsets[pixel + 1]
+            pixel_beta = beta[wp.where(beta.shape[0] > 1, pixel, 0)]
+            layer = replay(
+                rgba, depth, thickness, opacity_sum, begin, end, pixel_beta, max_layers, merge, mix, floor,
+                order, states, steps, row,
+            )  # fmt: skip
+            grad = zero_slab(scalar(0.0))
+            beta_sum = scalar(0.0)
+            ends_layer = bool(True)
+            for back in range(end - begin):
+                position = end - begin - 1 - back
+                fragment = order[row, position]
+                if ends_layer:
+                    layer -= 1
+                    grad = load_layer_grad(
+                        zero_slab(scalar(0.0)), states[row, position], pixel, layer,
+                        grad_layer_rgba, grad_layer_depth, grad_layer_thickness, grad_layer_opacity_sum,
+                    )  # fmt: skip
+                step = steps[row, position]
+                ends_layer = step == STEP_START
+                grad_fragment = grad
+                if step != STEP_START:
+                    following = load_slab(rgba, depth, thickness, opacity_sum, fragment)
+                    grad_running, grad_following, grad_step = take_step_back(
+                        step, grad, states[row, position - 1], following, pixel_beta, merge, mix, floor
+                    )
+                    grad = grad_running
+                    grad_fragment = grad_following
+                    beta_sum += grad_step
+                store_grad(
+                    grad_fragment, fragment, rgba, opacity_sum, grad_rgba, grad_depth, grad_thickness, grad_opacity_sum
+                )
+            if grad_beta.shape[0] > 0:
+                grad_beta[pixel] = beta_sum
+
+    return resolve_bwd
+
+
+def _output_like(inputs: Sequence[Any], max_layers: int, merge: str, mix: str) -> list[tuple[tuple[int, ...], str]]:
+    pixel_count = inputs[3].shape[0] - 1
+    per_layer = ((pixel_count, max_layers), "float")
+    return [((pixel_count, max_layers, 4), "float"), per_layer, per_layer, per_layer, ((pixel_count,), "int32")]
+
+
+def _forward(inputs: Sequence[Any], outputs: Sequence[Any], **options: Any) -> None:
+    walk = Walk(inputs, **options)
+    walk.forward(_forward_kernel(walk.scalar), outputs)
+
+
+def _backward(inputs: Sequence[Any], grad_outputs: Sequence[Any], grad_inputs: Sequence[Any], **options: Any) -> None:
+    walk = Walk(inputs, **options)
+    grads = [walk.optional(grad, ndim) for grad, ndim in zip(grad_outputs[:4], (3, 2, 2, 2), strict=True)]
+    walk.backward(_backward_kernel(walk.scalar), grads, grad_inputs)
+
+
+_RESOLVE = Operator(
+    name="resolve",
+    tensors=FRAGMENT_TENSORS,
+    differentiable=FRAGMENT_DIFFERENTIABLE,
+    outputs=("rgba", "depth", "thickness", "opacity_sum", "count"),
+    output_like=_output_like,
+    forward=_forward,
+    backward=_backward,
+    options=MERGE_OPTIONS,
+)
+
+
+def resolve(
+    fragments: Fragments,
+    beta: Any = 1.0,
+    *,
+    max_layers: int = 8,
+    merge: Merge = "smooth",
+    mix: Mix = "opacity",
+) -> Layers:
+    """Merge the fragments of every pixel into at most `max_layers` layers (fragment merging, Algorithm 1).
+
+    Differentiable in the fragments' colour, opacity, depth, thickness and opacity sum, and in beta; which fragments
+    merge, their order, and what falls into the tail are held fixed.
+
+    Args:
+        fragments: what to merge, in any order.
+        beta: how a slab fills up from its front to its back (eq. 4): 0 optically (exponential), 1 linearly. A number
+            from 0 to 1, a 0-d array, or one value per pixel.
+        max_layers: largest number M of layers per pixel; what does not fit is composited into the last.
+        merge: "smooth" subdivides overlapping slabs (SFM); "order_independent" mixes them whole (OFM); "none" keeps
+            every fragment by itself.
+        mix: weights of the colours of mixed parts: "opacity" (fragment merging, eq. 8), "average" (zSlab eq. 4.4) or
+            "optical_depth" (as deep images are flattened).
+
+    Returns:
+        The layers, in the kind and precision of the fragments' arrays.
+
+    Raises:
+        TypeError: an argument is of the wrong type, or beta of another kind or precision than the fragments.
+        ValueError: an option does not exist, or values are not finite or out of range.
+    """
+    check_options(merge, mix, max_layers)
+    options = {"max_layers": max_layers, "merge": merge, "mix": mix}
+    rgba, depth, thickness, opacity_sum, count = apply(_RESOLVE, fragment_inputs(fragments, beta), **options)
+    grid = fragments.shape
+    return Layers(
+        rgba.reshape((*grid, max_layers, 4)),
+        depth.reshape((*grid, max_layers)),
+        thickness.reshape((*grid, max_layers)),
+        opacity_sum.reshape((*grid, max_layers)),
+        count.reshape(grid),
+    )

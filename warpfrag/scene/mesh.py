@@ -1,0 +1,119 @@
+"""A triangle mesh on its way into a scene: what primitives and files give, and its normals."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles and how they look, before a scene file has its say.
+
+    Attributes:
+        vertices: (V, 3) float64.
+        faces: (N, 3) int32, indices into ``vertices``.
+        normals: (V, 3) float64 unit normals of the primitive's or file's own; None where there are none.
+        color: Straight linear RGB, (3,) or (V, 3); None where the file names no colour.
+        opacity: One number or (V,); None where the file names none.
+        uv: (V, 2) float32 texture coordinates, v up; None without.
+        textures: Straight linear RGBA images, (h, w, 4) float32, row 0 at the top.
+        texture_index: (N,) int32, the image of each face, −1 for none; None where all faces have image 0 (or there is none).
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    normals: np.ndarray | None = None
+    color: np.ndarray | None = None
+    opacity: float | np.ndarray | None = None
+    uv: np.ndarray | None = None
+    textures: list[np.ndarray] = field(default_factory=list)
+    texture_index: np.ndarray | None = None
+
+
+def split_faces(mesh: Mesh) -> Mesh:
+    """Give every face three vertices of its own (face-major), with flat normals."""
+    corner = mesh.faces.reshape(-1)
+
+    def pick(values):
+        return values[corner] if isinstance(values, np.ndarray) and len(values) == len(mesh.vertices) else values
+
+    return replace(
+        mesh,
+        vertices=mesh.vertices[corner],
+        faces=np.arange(len(corner), dtype=np.int32).reshape(-1, 3),
+        normals=np.repeat(_unit_rows(_area_vectors(mesh.vertices, mesh.faces)), 3, axis=0),
+        color=mesh.color if mesh.color is None or mesh.color.ndim == 1 else mesh.color[corner],
+        opacity=pick(mesh.opacity),
+        uv=pick(mesh.uv),
+    )
+
+
+def weld(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Merge vertices at bitwise equal positions; the first of each keeps its place in the order."""
+    unique, first, inverse = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    return unique[order], rank[inverse.reshape(-1)][faces].astype(np.int32)
+
+
+def smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Compute vertex normals: the faces' normals weighted by area and corner angle.
+
+    Vertices at the same position count as one, so that a texture seam does not show. Degenerate faces count for nothing.
+
+    Args:
+        vertices: (V, 3).
+        faces: (N, 3).
+
+    Returns:
+        (V, 3) float64 unit normals; zero for a vertex that no face of positive area uses.
+    """
+    points, corners = weld(np.asarray(vertices, dtype=np.float64), faces)
+    area = _area_vectors(points, corners)
+    total = np.zeros_like(points)
+    for corner in range(3):
+        here, ahead, behind = (points[corners[:, (corner + step) % 3]] for step in range(3))
+        # atan2 needs no normalised edges: an edge of length 0 has the angle 0, not NaN.
+        cosine = np.einsum("ij,ij->i", ahead - here, behind - here)
+        angle = np.arctan2(np.linalg.norm(area, axis=1), cosine)
+        for axis in range(3):
+            total[:, axis] += np.bincount(corners[:, corner], area[:, axis] * angle, minlength=len(points))
+    # Coincident faces of opposite winding cancel: such a vertex takes the normal of one of them.
+    size = np.linalg.norm(area, axis=1)
+    largest = np.zeros(len(points))
+    np.maximum.at(largest, corners.reshape(-1), np.repeat(size, 3))
+    lost = np.linalg.norm(total, axis=1) <= 1e-9 * largest
+    uses_lost = lost[corners] & (size > 0.0)[:, None]
+    face, corner_of = np.nonzero(uses_lost)
+    total[corners[face, corner_of]] = area[face]
+    normals = np.zeros((len(vertices), 3))
+    normals[faces.reshape(-1)] = _unit_rows(total)[corners.reshape(-1)]
+    return normals
+
+
+def lambert(normals: np.ndarray, towards_light: np.ndarray, ambient: float) -> np.ndarray:
+    """Return the two-sided Lambert factor ``ambient + (1 − ambient)·|n·l|`` of each vertex, (V,) float32.
+
+    Args:
+        normals: (V, 3) world-space normals of any length; a zero normal is lit by the ambient part alone.
+        towards_light: World direction towards the light, (3,) or one per vertex (V, 3), any length.
+        ambient: Share of the light that comes from everywhere, 0…1.
+    """
+    normals, light = _unit_rows(normals), _unit_rows(np.broadcast_to(towards_light, normals.shape))
+    facing = np.minimum(np.abs(np.einsum("ij,ij->i", normals, light)), 1.0)
+    return (ambient + (1.0 - ambient) * facing).astype(np.float32)
+
+
+def _area_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    first, second, third = (vertices[faces[:, corner]].astype(np.float64) for corner in range(3))
+    return np.cross(second - first, third - first)
+
+
+def _unit_rows(vectors: np.ndarray) -> np.ndarray:
+    vectors = np.asarray(vectors, dtype=np.float64)
+    largest = np.abs(vectors).max(axis=1, keepdims=True, initial=0.0)
+    # Tiny meshes have areas whose square underflows: scale by the largest component first.
+    scaled = vectors / np.where(largest > 0.0, largest, 1.0)
+    length = np.linalg.norm(scaled, axis=1, keepdims=True)
+    return scaled / np.where(length > 0.0, length, 1.0)
