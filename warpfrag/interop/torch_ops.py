@@ -107,6 +107,7 @@ def register(operator: Operator) -> None:
 
 
 def _share(tensors: Sequence[torch.Tensor | None]) -> tuple[wp.array | None, ...]:
+    wp.init()
     # Detached first: for a leaf that requires a gradient, from_torch would allocate one.
     return tuple(None if t is None else wp.from_torch(t.detach().contiguous()) for t in tensors)
 

@@ -137,9 +137,9 @@ class Walk:
         report_invalid(invalid, self.inputs)
 
     def backward(self, kernel: wp.Kernel, grads: Sequence[wp.array], grad_inputs: Sequence[wp.array | None]) -> None:
-        """Run a kernel that takes the arguments, `order`, `states`, `steps`, the output and the input gradients."""
+        """Run a kernel that takes the arguments, the scratch of `replay`, the output and the input gradients."""
         slab = slab_type(self.scalar)
-        rows = worker_count(self.pixel_count, self.device, (8 + wp._src.types.type_size_in_bytes(slab)) * self.length)
+        rows = worker_count(self.pixel_count, self.device, (8 + 10 * wp.types.type_size_in_bytes(self.scalar)) * self.length)
         grad_rgba, grad_depth, grad_thickness, _, grad_beta, grad_opacity_sum = grad_inputs
         beta_pixels = None
         if grad_beta is not None:
@@ -150,7 +150,7 @@ class Walk:
                 *((grad_rgba, 2), (grad_depth, 1), (grad_thickness, 1), (beta_pixels, 1), (grad_opacity_sum, 1)),
             )
         ]
-        scratch = [self.scratch(rows, dtype) for dtype in (wp.int32, slab, wp.int32)]
+        scratch = [self.scratch(rows, dtype) for dtype in (wp.int32, wp.int32, slab, self.scalar)]
         launch(kernel, self.pixel_count, [*self.arguments, *scratch, *grads, *targets], self.device, rows)
         if grad_beta is not None:
             sum_beta(beta_pixels, grad_beta)

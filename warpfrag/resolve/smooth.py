@@ -32,6 +32,7 @@ from warpfrag.resolve.arguments import (
 )
 from warpfrag.resolve.walk import (
     STEP_START,
+    adjoint_module,
     choose_step,
     load_slab,
     replay,
@@ -150,7 +151,7 @@ def _forward_kernel(scalar: Any) -> wp.Kernel:
 def _backward_kernel(scalar: Any) -> wp.Kernel:
     Slab = slab_type(scalar)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module=adjoint_module("resolve_bwd", scalar), enable_backward=False)
     def resolve_bwd(
         span: Span,
         rgba: wp.array2d(dtype=scalar),
@@ -164,8 +165,9 @@ def _backward_kernel(scalar: Any) -> wp.Kernel:
         mix: int,
         floor: scalar,
         order: wp.array2d(dtype=int),
-        states: wp.array2d(dtype=Slab),
         steps: wp.array2d(dtype=int),
+        states: wp.array2d(dtype=Slab),
+        through: wp.array2d(dtype=scalar),
         grad_layer_rgba: wp.array3d(dtype=scalar),
         grad_layer_depth: wp.array2d(dtype=scalar),
         grad_layer_thickness: wp.array2d(dtype=scalar),
@@ -183,7 +185,7 @@ def _backward_kernel(scalar: Any) -> wp.Kernel:
             pixel_beta = beta[wp.where(beta.shape[0] > 1, pixel, 0)]
             layer = replay(
                 rgba, depth, thickness, opacity_sum, begin, end, pixel_beta, max_layers, merge, mix, floor,
-                order, states, steps, row,
+                order, steps, states, through, row,
             )  # fmt: skip
             grad = zero_slab(scalar(0.0))
             beta_sum = scalar(0.0)

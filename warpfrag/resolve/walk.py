@@ -6,6 +6,7 @@ it fixed. The way back needs the running slab before each step; `replay` recompu
 belongs to the thread, so the forward pass stores nothing for the gradient.
 """
 
+from functools import cache
 from typing import Any
 
 import warp as wp
@@ -167,14 +168,15 @@ def sfm_pair(g: Any, a: Any, b: Any, beta: Any, mix: int, floor: Any):
 @wp.func
 def take_step_back(step: int, g: Any, a: Any, b: Any, beta: Any, merge: int, mix: int, floor: Any):
     """Return the gradients in a, b and beta of <g, take_step(step, a, b, ...)>."""
+    # `wp.grad` returns a gradient for every argument; those in g itself, mix and floor are of no use here.
     if step == STEP_TAIL:
-        _, tail_a, tail_b = wp.grad(over_pair)(g, a, b)
-        return tail_a, tail_b, type(beta)(0.0)
+        over_g, over_a, over_b = wp.grad(over_pair)(g, a, b)
+        return over_a, over_b, type(beta)(0.0)
     if merge == MERGE_SMOOTH:
-        _, smooth_a, smooth_b, smooth_beta, _, _ = wp.grad(sfm_pair)(g, a, b, beta, mix, floor)
-        return smooth_a, smooth_b, smooth_beta
-    _, mixed_a, mixed_b, _ = wp.grad(ofm_pair)(g, a, b, mix)
-    return mixed_a, mixed_b, type(beta)(0.0)
+        sfm_g, sfm_a, sfm_b, sfm_beta, sfm_mix, sfm_floor = wp.grad(sfm_pair)(g, a, b, beta, mix, floor)
+        return sfm_a, sfm_b, sfm_beta
+    ofm_g, ofm_a, ofm_b, ofm_mix = wp.grad(ofm_pair)(g, a, b, mix)
+    return ofm_a, ofm_b, type(beta)(0.0)
 
 
 @wp.func
@@ -197,22 +199,47 @@ def replay(
     mix: int,
     floor: Any,
     order: wp.array2d[int],
-    states: Any,
     steps: wp.array2d[int],
+    states: Any,
+    through: Any,
     row: int,
 ):
-    """Walk through a pixel's fragments, keeping each step and the running slab after it; return the layer count."""
+    """Walk through a pixel's fragments and keep, per position: step, running slab after it, transmittance up to its layer.
+
+    Returns the number of layers.
+    """
     sort_pixel(depth, thickness, begin, end, order, row)
     layer = int(0)
+    transmittance = type(beta)(1.0)
     for position in range(end - begin):
         following = load_slab(rgba, depth, thickness, opacity_sum, order[row, position])
         step = int(STEP_START)
         if position > 0:
             step = choose_step(states[row, position - 1], following, layer, max_layers, merge)
         if step == STEP_START:
+            if position > 0:
+                layer += 1
+                transmittance *= states[row, position - 1].t
             states[row, position] = following
-            layer += wp.where(position > 0, 1, 0)
         else:
             states[row, position] = take_step(step, states[row, position - 1], following, beta, merge, mix, floor)
         steps[row, position] = step
+        through[row, position] = transmittance
     return wp.where(end > begin, layer + 1, 0)
+
+
+@cache
+def adjoint_module(name: str, scalar: Any) -> wp.Module:
+    """Return a module for one backward kernel, in which the operators' adjoints exist.
+
+    `wp.grad` asks for the adjoints it needs, but Warp 1.19 leaves out those of functions that the same module has called
+    forward before: gradients come out zero, without a warning. A kernel with backward enabled has them made in any case.
+    """
+    module = wp.get_module(f"warpfrag.{name}.{scalar.__name__}")
+
+    @wp.kernel(module=module, enable_backward=True)
+    def adjoints(out: wp.array(dtype=scalar)):
+        s = zero_slab(out[0])
+        out[0] = over_pair(s, s, s) + ofm_pair(s, s, s, 0) + sfm_pair(s, s, s, out[0], 0, out[0])
+
+    return module

@@ -1,8 +1,8 @@
 """The camera: from scene units to pixels.
 
-Camera space has x to the right, y down and z forward (the planar depth), in scene units. Pixel (column, row) has its centre
-at +0.5, row 0 is the top one. A perspective camera looks along ((column + 0.5 − W/2)/f, (row + 0.5 − H/2)/f, 1) with
-f = (H/2)/tan(fov/2); an orthographic one along z from ((column + 0.5 − W/2), (row + 0.5 − H/2)) · height/H.
+Camera space has x to the right, y down and z forward (the planar depth), in scene units. Pixel (column, row) has its
+centre at +0.5, row 0 is the top one. A perspective camera looks along ((column + 0.5 − W/2)/f, (row + 0.5 − H/2)/f, 1)
+with f = (H/2)/tan(fov/2); an orthographic one along z from ((column + 0.5 − W/2), (row + 0.5 − H/2)) · height/H.
 """
 
 import math
@@ -28,7 +28,8 @@ class Camera:
         size: Width and height of the image [pixels].
 
     Raises:
-        ValueError: A value out of its range, both or neither of ``fov`` and ``height``, eye at the target, up along the view.
+        ValueError: A value out of its range, both or neither of ``fov`` and ``height``, eye at the target, up along the
+            view.
 
     Example:
         >>> Camera(eye=(0, 0, 2), target=(0, 0, 0), fov=90.0, size=(64, 48)).focal
@@ -47,12 +48,15 @@ class Camera:
     def __post_init__(self) -> None:
         for key in ("eye", "target", "up"):
             object.__setattr__(self, key, _triple(key, getattr(self, key)))
-        for key in ("near", "far") + tuple(key for key in ("fov", "height") if getattr(self, key) is not None):
-            object.__setattr__(self, key, _number(key, getattr(self, key)))
+        for key in ("fov", "height", "near", "far"):
+            value = getattr(self, key)
+            object.__setattr__(self, key, None if value is None else _number(key, value))
         object.__setattr__(self, "size", _size(self.size))
         if (self.fov is None) == (self.height is None):
             found = "neither" if self.fov is None else "both"
-            raise ValueError(f"camera: found {found} of fov and height, expected fov (perspective) or height (orthographic)")
+            raise ValueError(
+                f"camera: found {found} of fov and height, expected fov (perspective) or height (orthographic)"
+            )
         if self.fov is not None and not 0.0 < self.fov < 180.0:
             raise ValueError(f"camera.fov: found {self.fov:g}, expected degrees between 0 and 180")
         if self.height is not None and not self.height > 0.0:
@@ -67,7 +71,9 @@ class Camera:
         sine = np.linalg.norm(np.cross(_unit(forward), _unit(np.asarray(self.up)))) if any(self.up) else 0.0
         # Below this angle the image's own up direction is only rounding.
         if sine < 1e-9:
-            raise ValueError(f"camera.up: found {list(self.up)}, expected a direction that is not along the line of sight")
+            raise ValueError(
+                f"camera.up: found {list(self.up)}, expected a direction that is not along the line of sight"
+            )
 
     @property
     def width(self) -> int:
@@ -128,7 +134,11 @@ def _unit(vector: np.ndarray) -> np.ndarray:
 
 
 def _number(key: str, value: object) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)) or not math.isfinite(value):
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, (int, float, np.integer, np.floating))
+        or not math.isfinite(value)
+    ):
         raise ValueError(f"camera.{key}: found {shorten(value)}, expected a finite number")
     return float(value)
 

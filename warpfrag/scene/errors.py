@@ -5,7 +5,7 @@ from collections.abc import Iterable
 
 
 class SceneError(ValueError):
-    """A scene file, or a file it names, that cannot be used: one line with file, key, what was found and what is expected."""
+    """A scene file that cannot be used, in one line: file, key, what was found, what is expected."""
 
 
 def suggest(word: str, choices: Iterable[str]) -> str:
@@ -28,8 +28,5 @@ def shorten(value: object, limit: int = 60) -> str:
         return "true" if value else "false"
     if isinstance(value, dict):
         return "a table"
-    if isinstance(value, str):
-        text = '"' + value.replace("\n", "\\n") + '"'
-    else:
-        text = " ".join(repr(value).split())
+    text = '"' + value.replace("\n", "\\n") + '"' if isinstance(value, str) else " ".join(repr(value).split())
     return text if len(text) <= limit else text[: limit - 1] + "…"

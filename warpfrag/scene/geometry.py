@@ -1,7 +1,8 @@
 """A scene as flat arrays, ready for capture, with parameters put in the place of the scene's own values.
 
 Differentiable, with torch overrides: world vertices in ``"<name>.vertices"``, colour, opacity and thickness in theirs.
-Frozen: faces, transforms, textures and the baked Lambert factors (they stay those of the loaded mesh when vertices move).
+Frozen: faces, transforms, textures and the baked Lambert factors (they stay those of the loaded mesh when vertices
+move).
 """
 
 import sys
@@ -24,9 +25,11 @@ class Geometry:
         vertices: World space [scene units], (V, 3).
         faces: Indices into ``vertices``, (N, 3) int32 NumPy; objects one after the other, in submission order.
         rgba: Straight colour (shade included) and opacity, without textures, (V, 4).
-        thickness: z-thickness (V,), in scene units or multiples of P(z) as ``thickness_in_p`` says; 0 where there is a map.
+        thickness: z-thickness (V,), in scene units or multiples of P(z) as ``thickness_in_p`` says; 0 where there is a
+            map.
         object_id: Object of each face, (N,) int32 NumPy.
-        first_face: First face of each object and the total, (objects + 1,) int32 NumPy; primitive = face − first_face[object].
+        first_face: First face of each object and the total, (objects + 1,) int32 NumPy; primitive = face −
+            first_face[object].
         uv: Texture coordinates (V, 2) float32 NumPy, v up, repeating; None when nothing is textured.
         texture_id: Image of each face, (N,) int32 NumPy, −1 for none.
         textures: Straight linear RGBA images (h, w, 4) float32 NumPy, row 0 at the top, multiplied with ``rgba``.
@@ -52,13 +55,14 @@ def assemble(scene: Scene, parameters: Mapping[str, Any] | None = None, *, camer
 
     Args:
         scene: What to flatten.
-        parameters: Values by the names of ``scene.parameters()``: numbers, NumPy arrays or torch tensors. A thickness is in
-            the object's own unit; it may be one number, one per vertex, or an (H, W) map. ``"beta"`` is let through.
+        parameters: Values by the names of ``scene.parameters()``: numbers, NumPy arrays or torch tensors. A thickness
+            is in the object's own unit; it may be one number, one per vertex, or an (H, W) map. ``"beta"`` is let
+            through.
         camera: Whose pixel grid thickness maps must have; default the scene's.
 
     Returns:
-        Float arrays as torch tensors, differentiable in the overrides, if any override is a tensor, else NumPy; float64 if
-        any override is a float64 array or tensor, else float32.
+        Float arrays as torch tensors, differentiable in the overrides, if any override is a tensor, else NumPy; float64
+        if any override is a float64 array or tensor, else float32.
 
     Raises:
         ValueError: An unknown name, a wrong shape, a value out of range, or tensors on different devices.

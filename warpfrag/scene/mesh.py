@@ -14,10 +14,11 @@ class Mesh:
         faces: (N, 3) int32, indices into ``vertices``.
         normals: (V, 3) float64 unit normals of the primitive's or file's own; None where there are none.
         color: Straight linear RGB, (3,) or (V, 3); None where the file names no colour.
-        opacity: One number or (V,); None where the file names none.
+        opacity: One number (or 0-d array) or (V,); None where the file names none.
         uv: (V, 2) float32 texture coordinates, v up; None without.
         textures: Straight linear RGBA images, (h, w, 4) float32, row 0 at the top.
-        texture_index: (N,) int32, the image of each face, −1 for none; None where all faces have image 0 (or there is none).
+        texture_index: (N,) int32, the image of each face, −1 for none; None where all faces have image 0 (or there is
+            none).
     """
 
     vertices: np.ndarray
@@ -60,7 +61,8 @@ def weld(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarra
 def smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Compute vertex normals: the faces' normals weighted by area and corner angle.
 
-    Vertices at the same position count as one, so that a texture seam does not show. Degenerate faces count for nothing.
+    Vertices at the same position count as one, so that a texture seam does not show. Degenerate faces count for
+    nothing.
 
     Args:
         vertices: (V, 3).
@@ -90,6 +92,13 @@ def smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     normals = np.zeros((len(vertices), 3))
     normals[faces.reshape(-1)] = _unit_rows(total)[corners.reshape(-1)]
     return normals
+
+
+def transformed_normals(normals: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """Carry normals (V, 3) through the linear part of ``matrix``; of any length, NaN-free for singular matrices."""
+    # The cofactor matrix is the inverse transpose up to a factor, and exists for every matrix.
+    a, b, c = np.asarray(matrix, dtype=np.float64)[:3, :3]
+    return normals @ np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)]).T
 
 
 def lambert(normals: np.ndarray, towards_light: np.ndarray, ambient: float) -> np.ndarray:

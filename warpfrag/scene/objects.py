@@ -57,7 +57,9 @@ class SceneObject:
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name.strip():
             raise ValueError(f"object name: found {shorten(self.name)}, expected a text that is not blank")
-        self._fail_unless(self.thickness_unit in ("scene", "P"), "thickness_unit", self.thickness_unit, '"scene" or "P"')
+        self._fail_unless(
+            self.thickness_unit in ("scene", "P"), "thickness_unit", self.thickness_unit, '"scene" or "P"'
+        )
         self.vertices = np.ascontiguousarray(self._array("vertices", self.vertices), dtype=np.float32)
         check_parameter(self, "vertices", self.vertices)
         faces = np.asarray(self.faces)
@@ -111,7 +113,9 @@ class SceneObject:
         if self.texture_index is not None:
             index = self.texture_index = np.ascontiguousarray(self.texture_index, dtype=np.int32)
             expected = f"shape ({len(self.faces)},) of numbers from -1 to {len(images) - 1}"
-            fits = index.shape == (len(self.faces),) and (index.size == 0 or -1 <= index.min() <= index.max() < len(images))
+            fits = index.shape == (len(self.faces),) and (
+                index.size == 0 or -1 <= index.min() <= index.max() < len(images)
+            )
             self._fail_unless(fits, "texture_index", f"shape {index.shape}", expected)
 
     def _array(self, key: str, value: Any) -> np.ndarray:
@@ -160,7 +164,9 @@ class Scene:
         background = np.asarray(self.background, dtype=np.float64)
         if background.shape != (4,) or not np.isfinite(background).all() or background.min() < 0 or background[3] > 1:
             found = shorten(self.background)
-            raise ValueError(f"background: found {found}, expected premultiplied RGBA: 4 numbers from 0, the last up to 1")
+            raise ValueError(
+                f"background: found {found}, expected premultiplied RGBA: 4 numbers from 0, the last up to 1"
+            )
         red, green, blue, alpha = background.tolist()
         self.background = (red, green, blue, alpha)
         if isinstance(self.beta, bool) or not isinstance(self.beta, (int, float)) or not 0.0 <= self.beta <= 1.0:
@@ -175,8 +181,9 @@ class Scene:
         """Return what can be overridden, fitted or differentiated, by name.
 
         Returns:
-            ``"beta"``, and for each object ``"<name>.thickness"`` (in the object's own ``thickness_unit``), ``".color"``,
-            ``".opacity"`` and ``".vertices"`` (its own space): floats and copies of arrays, safe to change.
+            ``"beta"``, and for each object ``"<name>.thickness"`` (in the object's own ``thickness_unit``),
+            ``".color"``, ``".opacity"`` and ``".vertices"`` (its own space): floats and copies of arrays, safe to
+            change.
 
         Example:
             >>> sorted(scene.parameters())
@@ -186,7 +193,9 @@ class Scene:
         for item in self.objects:
             for key in PARAMETER_KEYS:
                 value = getattr(item, key)
-                result[f"{item.name}.{key}"] = float(value) if np.ndim(value) == 0 else np.array(value, dtype=np.float32)
+                result[f"{item.name}.{key}"] = (
+                    float(value) if np.ndim(value) == 0 else np.array(value, dtype=np.float32)
+                )
         return result
 
 

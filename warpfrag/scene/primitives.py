@@ -1,7 +1,7 @@
 """Primitive shapes, centred on the origin, with their own normals and texture coordinates.
 
-Round shapes stand along y. A plane or grid lies in the x–y plane and faces +z. Without texture coordinates a round shape is
-closed, with one vertex at each position of a smooth part; with them it is cut open along a seam.
+Round shapes stand along y. A plane or grid lies in the x–y plane and faces +z. Without texture coordinates a round
+shape is closed, with one vertex at each position of a smooth part; with them it is cut open along a seam.
 """
 
 from collections.abc import Callable
@@ -61,7 +61,7 @@ def cone(radius: float = 1.0, height: float = 2.0, segments: int = 64, *, uv: bo
 
     def normal(u, v):
         # Each triangle's tip vertex takes the normal of the middle of its segment.
-        u = np.where(v == 1.0, u + 0.5 / segments, u)
+        u = np.where(v == 1.0, u - 0.5 / segments, u)
         return np.stack([slope[0] * np.sin(_TURN * u), slope[1] + 0.0 * u, slope[0] * np.cos(_TURN * u)], axis=-1)
 
     def point(u, v):

@@ -1,0 +1,347 @@
+"""Compositing: layers, or fragments straight away, to an image.
+
+    C = sum_i T_i C_i,   A = 1 - prod_i (1 - A_i),   T_i = prod_{j < i} (1 - A_j)   (premultiplied, front to back)
+
+On the way back the colour B_i behind layer i is carried along instead of being divided out:
+
+    dL/dC_i = T_i g,   dL/d(1 - A_i) = T_i (g . B_i - g_A T_behind),   B_{i-1} = C_i + (1 - A_i) B_i
+
+so opaque layers have exact gradients. Everything is differentiable; the fused version holds fixed what `resolve` does.
+"""
+
+import math
+from collections.abc import Sequence
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from warpfrag.fragments import Fragments, Layers
+from warpfrag.interop.launch import Span, launch
+from warpfrag.interop.operator import Operator, apply
+from warpfrag.resolve.arguments import (
+    FRAGMENT_DIFFERENTIABLE,
+    FRAGMENT_TENSORS,
+    MERGE_OPTIONS,
+    Merge,
+    Mix,
+    Walk,
+    as_int32,
+    check_options,
+    fragment_inputs,
+    slab_type,
+)
+from warpfrag.resolve.walk import (
+    STEP_START,
+    adjoint_module,
+    choose_step,
+    load_slab,
+    replay,
+    sort_pixel,
+    store_grad,
+    take_step,
+    take_step_back,
+    valid_fragment,
+    zero_slab,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+
+@cache
+def _layers_forward_kernel(scalar: Any) -> wp.Kernel:
+    @wp.kernel(module="unique", enable_backward=False)
+    def composite_layers_fwd(
+        span: Span,
+        rgba: wp.array3d(dtype=scalar),
+        count: wp.array(dtype=int),
+        image: wp.array2d(dtype=scalar),
+    ):
+        for pixel in range(span.begin + wp.tid(), span.end, span.stride):
+            transmittance = scalar(1.0)
+            red = scalar(0.0)
+            green = scalar(0.0)
+            blue = scalar(0.0)
+            for layer in range(wp.clamp(count[pixel], 0, rgba.shape[1])):
+                red += transmittance * rgba[pixel, layer, 0]
+                green += transmittance * rgba[pixel, layer, 1]
+                blue += transmittance * rgba[pixel, layer, 2]
+                transmittance *= scalar(1.0) - rgba[pixel, layer, 3]
+            image[pixel, 0] = red
+            image[pixel, 1] = green
+            image[pixel, 2] = blue
+            image[pixel, 3] = scalar(1.0) - transmittance
+
+    return composite_layers_fwd
+
+
+@cache
+def _layers_backward_kernel(scalar: Any) -> wp.Kernel:
+    vec3 = wp.types.vector(3, scalar)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def composite_layers_bwd(
+        span: Span,
+        rgba: wp.array3d(dtype=scalar),
+        count: wp.array(dtype=int),
+        grad_image: wp.array2d(dtype=scalar),
+        grad_rgba: wp.array3d(dtype=scalar),
+    ):
+        for pixel in range(span.begin + wp.tid(), span.end, span.stride):
+            layer_count = wp.clamp(count[pixel], 0, rgba.shape[1])
+            # The transmittance up to each layer waits where its opacity's gradient will be.
+            transmittance = scalar(1.0)
+            for layer in range(rgba.shape[1]):
+                grad_rgba[pixel, layer, 3] = wp.where(layer < layer_count, transmittance, scalar(0.0))
+                transmittance *= scalar(1.0) - rgba[pixel, layer, 3]
+            g = vec3(grad_image[pixel, 0], grad_image[pixel, 1], grad_image[pixel, 2])
+            behind = vec3()
+            transmittance_behind = scalar(1.0)
+            for back in range(rgba.shape[1]):
+                layer = rgba.shape[1] - 1 - back
+                t = grad_rgba[pixel, layer, 3]
+                grad_rgba[pixel, layer, 0] = t * g[0]
+                grad_rgba[pixel, layer, 1] = t * g[1]
+                grad_rgba[pixel, layer, 2] = t * g[2]
+                grad_rgba[pixel, layer, 3] = t * (grad_image[pixel, 3] * transmittance_behind - wp.dot(g, behind))
+                if layer < layer_count:
+                    through = scalar(1.0) - rgba[pixel, layer, 3]
+                    color = vec3(rgba[pixel, layer, 0], rgba[pixel, layer, 1], rgba[pixel, layer, 2])
+                    behind = color + through * behind
+                    transmittance_behind *= through
+
+    return composite_layers_bwd
+
+
+def _layers_output_like(inputs: Sequence[Any]) -> list[tuple[tuple[int, ...], str]]:
+    return [((inputs[0].shape[0], 4), "float")]
+
+
+def _layers_forward(inputs: Sequence[Any], outputs: Sequence[Any]) -> None:
+    rgba = inputs[0]
+    launch(_layers_forward_kernel(rgba.dtype), rgba.shape[0], [*inputs, *outputs], rgba.device)
+
+
+def _layers_backward(inputs: Sequence[Any], grad_outputs: Sequence[Any], grad_inputs: Sequence[Any]) -> None:
+    rgba = inputs[0]
+    kernel = _layers_backward_kernel(rgba.dtype)
+    launch(kernel, rgba.shape[0], [*inputs, grad_outputs[0], grad_inputs[0]], rgba.device)
+
+
+_COMPOSITE_LAYERS = Operator(
+    name="composite_layers",
+    tensors=("rgba", "count"),
+    differentiable=("rgba",),
+    outputs=("image",),
+    output_like=_layers_output_like,
+    forward=_layers_forward,
+    backward=_layers_backward,
+)
+
+
+@cache
+def _fragments_forward_kernel(scalar: Any) -> wp.Kernel:
+    vec3 = wp.types.vector(3, scalar)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def composite_fragments_fwd(
+        span: Span,
+        rgba: wp.array2d(dtype=scalar),
+        depth: wp.array(dtype=scalar),
+        thickness: wp.array(dtype=scalar),
+        offsets: wp.array(dtype=int),
+        beta: wp.array(dtype=scalar),
+        opacity_sum: wp.array(dtype=scalar),
+        max_layers: int,
+        merge: int,
+        mix: int,
+        floor: scalar,
+        order: wp.array2d(dtype=int),
+        invalid: wp.array2d(dtype=int),
+        image: wp.array2d(dtype=scalar),
+    ):
+        row = span.worker + wp.tid()
+        for pixel in range(span.begin + wp.tid(), span.end, span.stride):
+            begin = offsets[pixel]
+            end = offsets[pixel + 1]
+            pixel_beta = beta[wp.where(beta.shape[0] > 1, pixel, 0)]
+            if not (pixel_beta >= scalar(0.0) and pixel_beta <= scalar(1.0)):
+                wp.atomic_min(invalid, span.worker, 1, pixel)
+            sort_pixel(depth, thickness, begin, end, order, row)
+            running = zero_slab(scalar(0.0))
+            running.t = scalar(1.0)
+            color = vec3()
+            transmittance = scalar(1.0)
+            layer = int(0)
+            for position in range(end - begin):
+                fragment = order[row, position]
+                if not valid_fragment(rgba, depth, thickness, fragment):
+                    wp.atomic_min(invalid, span.worker, 0, fragment)
+                following = load_slab(rgba, depth, thickness, opacity_sum, fragment)
+                if position == 0:
+                    running = following
+                else:
+                    step = choose_step(running, following, layer, max_layers, merge)
+                    if step == STEP_START:
+                        color += transmittance * running.c
+                        transmittance *= running.t
+                        running = following
+                        layer += 1
+                    else:
+                        running = take_step(step, running, following, pixel_beta, merge, mix, floor)
+            color += transmittance * running.c
+            image[pixel, 0] = color[0]
+            image[pixel, 1] = color[1]
+            image[pixel, 2] = color[2]
+            image[pixel, 3] = scalar(1.0) - transmittance * running.t
+
+    return composite_fragments_fwd
+
+
+@cache
+def _fragments_backward_kernel(scalar: Any) -> wp.Kernel:
+    Slab = slab_type(scalar)
+    vec3 = wp.types.vector(3, scalar)
+
+    @wp.kernel(module=adjoint_module("composite_fragments_bwd", scalar), enable_backward=False)
+    def composite_fragments_bwd(
+        span: Span,
+        rgba: wp.array2d(dtype=scalar),
+        depth: wp.array(dtype=scalar),
+        thickness: wp.array(dtype=scalar),
+        offsets: wp.array(dtype=int),
+        beta: wp.array(dtype=scalar),
+        opacity_sum: wp.array(dtype=scalar),
+        max_layers: int,
+        merge: int,
+        mix: int,
+        floor: scalar,
+        order: wp.array2d(dtype=int),
+        steps: wp.array2d(dtype=int),
+        states: wp.array2d(dtype=Slab),
+        through: wp.array2d(dtype=scalar),
+        grad_image: wp.array2d(dtype=scalar),
+        grad_rgba: wp.array2d(dtype=scalar),
+        grad_depth: wp.array(dtype=scalar),
+        grad_thickness: wp.array(dtype=scalar),
+        grad_beta: wp.array(dtype=scalar),
+        grad_opacity_sum: wp.array(dtype=scalar),
+    ):
+        row = span.worker + wp.tid()
+        for pixel in range(span.begin + wp.tid(), span.end, span.stride):
+            begin = offsets[pixel]
+            count = offsets[pixel + 1] - begin
+            pixel_beta = beta[wp.where(beta.shape[0] > 1, pixel, 0)]
+            replay(
+                rgba, depth, thickness, opacity_sum, begin, begin + count, pixel_beta, max_layers, merge, mix, floor,
+                order, steps, states, through, row,
+            )  # fmt: skip
+            g = vec3(grad_image[pixel, 0], grad_image[pixel, 1], grad_image[pixel, 2])
+            behind = vec3()
+            transmittance_behind = scalar(1.0)
+            grad = zero_slab(scalar(0.0))
+            beta_sum = scalar(0.0)
+            ends_layer = bool(True)
+            for back in range(count):
+                position = count - 1 - back
+                fragment = order[row, position]
+                step = steps[row, position]
+                if ends_layer:
+                    layer = states[row, position]
+                    t = through[row, position]
+                    grad = zero_slab(scalar(0.0))
+                    grad.c = t * g
+                    grad.t = t * (wp.dot(g, behind) - grad_image[pixel, 3] * transmittance_behind)
+                    behind = layer.c + layer.t * behind
+                    transmittance_behind *= layer.t
+                ends_layer = step == STEP_START
+                grad_fragment = grad
+                if step != STEP_START:
+                    following = load_slab(rgba, depth, thickness, opacity_sum, fragment)
+                    grad_running, grad_following, grad_step = take_step_back(
+                        step, grad, states[row, position - 1], following, pixel_beta, merge, mix, floor
+                    )
+                    grad = grad_running
+                    grad_fragment = grad_following
+                    beta_sum += grad_step
+                store_grad(
+                    grad_fragment, fragment, rgba, opacity_sum, grad_rgba, grad_depth, grad_thickness, grad_opacity_sum
+                )
+            if grad_beta.shape[0] > 0:
+                grad_beta[pixel] = beta_sum
+
+    return composite_fragments_bwd
+
+
+def _fragments_output_like(
+    inputs: Sequence[Any], max_layers: int, merge: str, mix: str
+) -> list[tuple[tuple[int, ...], str]]:
+    return [((inputs[3].shape[0] - 1, 4), "float")]
+
+
+def _fragments_forward(inputs: Sequence[Any], outputs: Sequence[Any], **options: Any) -> None:
+    walk = Walk(inputs, **options)
+    walk.forward(_fragments_forward_kernel(walk.scalar), outputs)
+
+
+def _fragments_backward(
+    inputs: Sequence[Any], grad_outputs: Sequence[Any], grad_inputs: Sequence[Any], **options: Any
+) -> None:
+    walk = Walk(inputs, **options)
+    walk.backward(_fragments_backward_kernel(walk.scalar), grad_outputs, grad_inputs)
+
+
+_COMPOSITE_FRAGMENTS = Operator(
+    name="composite_fragments",
+    tensors=FRAGMENT_TENSORS,
+    differentiable=FRAGMENT_DIFFERENTIABLE,
+    outputs=("image",),
+    output_like=_fragments_output_like,
+    forward=_fragments_forward,
+    backward=_fragments_backward,
+    options=MERGE_OPTIONS,
+)
+
+
+def composite(
+    source: Layers | Fragments,
+    beta: Any = None,
+    *,
+    max_layers: int | None = None,
+    merge: Merge | None = None,
+    mix: Mix | None = None,
+) -> Any:
+    """Composite layers, or fragments straight away, front to back by the over operator.
+
+    With fragments the image is that of `composite(resolve(fragments, ...))`, and its gradient too, but no layer is
+    stored in between. Differentiable in everything `resolve` is, and in the layers' `rgba`; exact at opacity 1.
+
+    Args:
+        source: what to composite. Layers have been merged before, so the options below go with fragments only.
+        beta: see `resolve`; default 1.
+        max_layers: see `resolve`; default 8.
+        merge: see `resolve`; default "smooth".
+        mix: see `resolve`; default "opacity".
+
+    Returns:
+        Premultiplied linear colour and opacity, (H, W, 4), in the kind and precision of the source's arrays.
+
+    Raises:
+        TypeError: an argument is of the wrong type, or options were given together with layers.
+        ValueError: an option does not exist, or values are not finite or out of range.
+    """
+    given = {"beta": beta, "max_layers": max_layers, "merge": merge, "mix": mix}
+    if isinstance(source, Layers):
+        for name, value in given.items():
+            if value is not None:
+                raise TypeError(f"{name}: goes with Fragments only, the layers of {type(source).__name__} are merged")
+        pixel_count = math.prod(source.shape)
+        rgba = source.rgba.reshape((pixel_count, source.max_layers, 4))
+        (image,) = apply(_COMPOSITE_LAYERS, (rgba, as_int32(source.count).reshape((pixel_count,))))
+        return image.reshape((*source.shape, 4))
+    defaults = {"beta": 1.0, "max_layers": 8, "merge": "smooth", "mix": "opacity"}
+    chosen = {name: default if given[name] is None else given[name] for name, default in defaults.items()}
+    inputs = fragment_inputs(source, chosen.pop("beta"))
+    check_options(**chosen)
+    (image,) = apply(_COMPOSITE_FRAGMENTS, inputs, **chosen)
+    return image.reshape((*source.shape, 4))
