@@ -4,6 +4,7 @@ Depths and thicknesses are multiples of 2^-10 below 2^13, and colours and opacit
 and all boundaries `depth - thickness` are exact in single precision too: order and overlap come out the same in both.
 """
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -29,6 +30,16 @@ KINDS = (
     "far_apart",
 )
 """The degenerate cases: those of whole pixels, of opacity, of extent."""
+
+PLACED_BY_ANOTHER = {"equal_depths", "equal_fronts", "identical", "touching", "nested"}
+
+SPECIAL_OPACITY = {
+    "transparent": 0.0,
+    "emissive": 0.0,
+    "opaque": 1.0,
+    "nearly_opaque": 1.0 - 1e-7,
+    "nearly_transparent": 1e-7,
+}
 
 
 class Pixels(NamedTuple):
@@ -77,7 +88,7 @@ def generic_pixels(
         depth, thickness = draw_extents(rng, fragment_count, set())
         boundaries = np.concatenate([depth - thickness, depth])
         order = np.argsort(boundaries, kind="stable")
-        for before, after in zip(order, order[1:], strict=False):
+        for before, after in pairwise(order):
             # Pushing later boundaries back keeps their order, so fronts stay in front of their backs.
             boundaries[after] = max(boundaries[after], boundaries[before] + margin)
         front, depth = np.split(boundaries, 2)
@@ -87,7 +98,7 @@ def generic_pixels(
 
 
 def draw_extents(rng: np.random.Generator, fragment_count: int, kinds: set[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Draw depths and thicknesses of a pixel on the grid, about half of the fragments of the degenerate kinds."""
+    """Draw depths and thicknesses of a pixel on the grid, placing some of them by another as `kinds` says."""
     depth = on_grid(rng.uniform(2.0, 6.0, fragment_count))
     thickness = on_grid(rng.uniform(0.0, 1.0, fragment_count) * rng.choice([0.2, 1.0, 2.0])) + GRID
     if "far_apart" in kinds:
@@ -120,15 +131,8 @@ def draw_extents(rng: np.random.Generator, fragment_count: int, kinds: set[str])
 def draw_rgba(rng: np.random.Generator, fragment_count: int, kinds: set[str]) -> np.ndarray:
     """Draw premultiplied colours, about a third of the opacities of each degenerate kind."""
     opacity = rng.uniform(0.05, 0.95, fragment_count)
-    special = {
-        "transparent": 0.0,
-        "emissive": 0.0,
-        "opaque": 1.0,
-        "nearly_opaque": 1.0 - 1e-7,
-        "nearly_transparent": 1e-7,
-    }
-    for kind in sorted(kinds & special.keys()):
-        opacity = np.where(rng.random(fragment_count) < 1.0 / 3.0, special[kind], opacity)
+    for kind in sorted(kinds & SPECIAL_OPACITY.keys()):
+        opacity = np.where(rng.random(fragment_count) < 1.0 / 3.0, SPECIAL_OPACITY[kind], opacity)
     color = rng.uniform(0.0, 1.0, (fragment_count, 3)) * opacity[:, None]
     if "emissive" in kinds:
         color[opacity == 0.0] = rng.uniform(0.0, 1.0, (int(np.sum(opacity == 0.0)), 3))

@@ -177,27 +177,27 @@ def part_share(fragment: Fragment, r0: float, r1: float, beta: float, mix: str) 
     """A_01 / A, which tends to r1 - r0 as A → 0."""
     opacity = fragment.opacity
     length = r1 - r0
+    passed = transmittance_to(fragment, r0, beta, mix)
+    if passed.real == 0.0:
+        # Nothing reaches this part, 0/0: infinitely dense, it is opaque where it has any length.
+        return 1.0 if length.real > 0.0 else 0.0
     before = optical_transmittance(fragment, r0, mix)
     optical_depth = slab_optical_depth(fragment, mix)
     if math.isinf(optical_depth.real):
-        if length.real == 0.0:
-            return 0.0
-        if beta.real == 0.0 and r0.real > 0.0:
-            # Nothing reaches this part, 0/0: infinitely dense, it is opaque.
-            return 1.0
-        optical = before / opacity
+        optical = before / opacity if length.real > 0.0 else 0.0
     else:
         ratio = depth_per_opacity(opacity) if 1.0 - opacity.real >= FLOOR else optical_depth / opacity
         optical = before * length * ratio * absorbed_per_depth(length * optical_depth)
     if r1 == 1.0 and 1.0 - opacity.real < FLOOR:
         # The floor does not hold for the whole: its back boundary is reached with 1 - A.
         optical = optical + (optical_transmittance(fragment, 1.0, mix) - (1.0 - opacity)) / opacity
-    return (beta * length + (1.0 - beta) * optical) / transmittance_to(fragment, r0, beta, mix)
+    return (beta * length + (1.0 - beta) * optical) / passed
 
 
 def part_between(fragment: Fragment, begin: float, end: float, beta: float, mix: str = "opacity") -> Piece:
     """The part of a fragment's slab between two depths; a fragment without thickness is not divided."""
-    if fragment.thickness.real == 0.0:
+    if fragment.front.real >= fragment.depth.real:
+        # Also where the thickness is lost in the rounding of the depth: no boundary lies inside such a slab.
         return part(fragment, 0.0, 1.0, beta, mix)
 
     def relative(depth: float) -> float:

@@ -33,14 +33,13 @@ from warpfrag.resolve.arguments import (
 )
 from warpfrag.resolve.walk import (
     STEP_START,
-    adjoint_module,
     choose_step,
     load_slab,
     replay,
     sort_pixel,
     store_grad,
     take_step,
-    take_step_back,
+    take_step_adjoint,
     valid_fragment,
     zero_slab,
 )
@@ -203,7 +202,7 @@ def _fragments_backward_kernel(scalar: Any) -> wp.Kernel:
     Slab = slab_type(scalar)
     vec3 = wp.types.vector(3, scalar)
 
-    @wp.kernel(module=adjoint_module("composite_fragments_bwd", scalar), enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False)
     def composite_fragments_bwd(
         span: Span,
         rgba: wp.array2d(dtype=scalar),
@@ -258,7 +257,7 @@ def _fragments_backward_kernel(scalar: Any) -> wp.Kernel:
                 grad_fragment = grad
                 if step != STEP_START:
                     following = load_slab(rgba, depth, thickness, opacity_sum, fragment)
-                    grad_running, grad_following, grad_step = take_step_back(
+                    grad_running, grad_following, grad_step = take_step_adjoint(
                         step, grad, states[row, position - 1], following, pixel_beta, merge, mix, floor
                     )
                     grad = grad_running

@@ -1,11 +1,22 @@
-"""The formulas: slabs, and how two of them become one. Straight-line functions, so that Warp differentiates them.
+"""The formulas: slabs, how two of them become one, and the adjoints of that.
 
 A slab is a fragment with its z-thickness: premultiplied colour `c`, opacity `a`, transmittance `t = 1 - a`, logarithm of
 it `l`, weight `w = S/A` (the opacity sum per opacity: 1 for a fresh fragment), front depth `f`, back depth `z`.
 Transmittance multiplies and its logarithm adds however slabs are merged, so both are carried along and never computed
 from a rounded opacity: that keeps opaque slabs exact and costs one logarithm per fragment.
 
-All functions are generic over `Slab32` and `Slab64`. Equation numbers are those of the fragment-merging paper.
+Merging two slabs takes the gains x, y, v: which share of its opacity a slab gains in one piece of its length (eq. 4).
+For overlapping slabs a, b with a.z <= b.z the pieces are: the front part of one alone, gaining 1 - x or 1 - y - v; the
+rest of a (x) mixed with as much of b (y); the rest of b (v). Order-independent merging is x = y = 1, v = 0. With
+
+    D_a = T_a + A_a x,   D_2 = T_b + A_b v,   D_1 = D_2 + A_b y       (transmittance up to the rest of a, b, the mix)
+
+a piece's part of the slab has opacity gain / D, and over multiplies by D again: the merged colour is
+(1 - x + mixed_a) C_a + (1 - y - v + mixed_b + T_a v) C_b, a sum of positive terms in which no D divides.
+
+An adjoint `..._adjoint(g, ...)` returns the vector-Jacobian product of its operator with the cotangent g. It treats a, t
+and l as independent: their sum is the derivative in opacity. All functions are generic over `Slab32` and `Slab64`.
+Equation numbers are those of the fragment-merging paper.
 """
 
 import math
@@ -125,57 +136,49 @@ def power(s: Any, r: Any, floor: Any):
 def series(a: Any, r: Any):
     """Return (1 - (1 - A)^r)/A for small A: the binomial series, to A^6."""
     one = type(a)(1.0)
-    sum = one + (type(a)(6.0) - r) * a / type(a)(7.0)
-    sum = one + (type(a)(5.0) - r) * a / type(a)(6.0) * sum
-    sum = one + (type(a)(4.0) - r) * a / type(a)(5.0) * sum
-    sum = one + (type(a)(3.0) - r) * a / type(a)(4.0) * sum
-    sum = one + (type(a)(2.0) - r) * a / type(a)(3.0) * sum
-    sum = one + (one - r) * a / type(a)(2.0) * sum
+    sum = type(a)(1.0)
+    for i in range(6):
+        k = type(a)(6 - i)
+        sum = one + (k - r) / (k + one) * a * sum
     return r * sum
 
 
 @wp.func
-def optical_gain(s: Any, r0: Any, r1: Any, power0: Any, power1: Any):
-    """Return (A(r1) - A(r0))/A in the optical model; power0 and power1 are T^r0 and T^r1."""
-    if s.a < type(r0)(SERIES_OPACITY):
-        return series(s.a, r1) - series(s.a, r0)
-    return (power0 - power1) / s.a
-
-
-@wp.func
-def mix_color(c1: Any, a1: Any, t1: Any, w1: Any, c2: Any, a2: Any, t2: Any, w2: Any, mix: int):
-    """Return the colour of two mixed parts (eq. 6-8; zSlab eq. 4.1-4.4); t1 and t2 are 1 - a1 and 1 - a2."""
-    one = type(a1)(1.0)
-    if mix == MIX_AVERAGE:
-        return c1 + c2 - (c1 * a2 + c2 * a1) * type(a1)(0.5)
-    a = a1 + a2 * t1
-    if mix == MIX_OPTICAL_DEPTH:
-        # Opaque parts win; two of them are averaged.
-        if t1 <= type(a1)(0.0) and t2 <= type(a1)(0.0):
-            return (c1 + c2) * type(a1)(0.5)
-        if t1 <= type(a1)(0.0):
-            return c1
-        if t2 <= type(a1)(0.0):
-            return c2
-        v1 = depth_per_opacity(a1, t1)
-        v2 = depth_per_opacity(a2, t2)
-        return (c1 * v1 + c2 * v2) * divide(a, a1 * v1 + a2 * v2, one)
-    return (c1 * w1 + c2 * w2) * divide(a, a1 * w1 + a2 * w2, one)
+def series_gradient(a: Any, r: Any):
+    """Return the derivatives of `series` in A and in r."""
+    one = type(a)(1.0)
+    sum = type(a)(1.0)
+    by_a = type(a)(0.0)
+    by_r = type(a)(0.0)
+    for i in range(6):
+        k = type(a)(6 - i)
+        factor = (k - r) / (k + one)
+        by_a = factor * (sum + a * by_a)
+        by_r = a * (factor * by_r - sum / (k + one))
+        sum = one + factor * a * sum
+    return r * by_a, sum + r * by_r
 
 
 @wp.func
 def depth_per_opacity(a: Any, t: Any):
     """Return u/A, the optical depth -log(1 - A) per opacity; 1 where A = 0."""
     if a < type(a)(SERIES_OPACITY):
-        one = type(a)(1.0)
-        sum = one / type(a)(7.0)
-        sum = one / type(a)(6.0) + a * sum
-        sum = one / type(a)(5.0) + a * sum
-        sum = one / type(a)(4.0) + a * sum
-        sum = one / type(a)(3.0) + a * sum
-        sum = one / type(a)(2.0) + a * sum
-        return one + a * sum
+        sum = type(a)(0.0)
+        for i in range(7):
+            sum = type(a)(1.0) / type(a)(7 - i) + a * sum
+        return sum
     return -wp.log(t) / a
+
+
+@wp.func
+def depth_per_opacity_gradient(a: Any, t: Any):
+    """Return the derivatives of `depth_per_opacity` in A and in 1 - A."""
+    if a < type(a)(SERIES_OPACITY):
+        sum = type(a)(0.0)
+        for i in range(6):
+            sum = type(a)(6 - i) / type(a)(7 - i) + a * sum
+        return sum, type(a)(0.0)
+    return wp.log(t) / (a * a), type(a)(-1.0) / (t * a)
 
 
 @wp.func
@@ -187,62 +190,278 @@ def over(a: Any, b: Any):
 
 
 @wp.func
-def ofm(a: Any, b: Any, mix: int):
-    """Return the order-independent merging of two slabs (section 3.2.2): they are mixed whole."""
+def over_adjoint(g: Any, a: Any, b: Any):
     opacity = a.a + a.t * b.a
     weight = divide(a.a * a.w + b.a * b.w, opacity, type(opacity)(1.0))
-    c = mix_color(a.c, a.a, a.t, a.w, b.c, b.a, b.t, b.w, mix)
+    g_sum = divide(g.w, opacity, type(opacity)(0.0))
+    g_opacity = g.a - g_sum * weight
+    g_t = wp.dot(g.c, b.c) + g_opacity * b.a + g.t * b.t
+    g_a = slab(g.c, g_opacity + g_sum * a.w, g_t, g.l, g_sum * a.a, g.f, type(opacity)(0.0))
+    g_b = slab(
+        a.t * g.c, g_opacity * a.t + g_sum * b.w, g.t * a.t, g.l, g_sum * b.a, type(opacity)(0.0), g.z
+    )
+    return g_a, g_b
+
+
+@wp.func
+def relative_lengths(a: Any, b: Any):
+    """Return the lengths of the pieces relative to their slabs, a = [a0 | a1], b = [b0 | b1 | b2]; a0 = 0 or b0 = 0."""
+    inner = wp.max(a.f, b.f)
+    per_b = type(inner)(1.0) / (b.z - b.f)
+    a0 = type(inner)(0.0)
+    a1 = type(inner)(1.0)
+    if a.z > a.f:
+        # A slab without thickness is not divided.
+        per_a = type(inner)(1.0) / (a.z - a.f)
+        a0 = (inner - a.f) * per_a
+        a1 = (a.z - inner) * per_a
+    return a0, a1, (inner - b.f) * per_b, (a.z - inner) * per_b, (b.z - a.z) * per_b
+
+
+@wp.func
+def optical_gain(s: Any, r0: Any, r1: Any, power0: Any, power1: Any):
+    """Return (A(r1) - A(r0))/A in the optical model; power0 and power1 are T^r0 and T^r1."""
+    if s.a < type(r0)(SERIES_OPACITY):
+        return series(s.a, r1) - series(s.a, r0)
+    return (power0 - power1) / s.a
+
+
+@wp.func
+def smooth_gains(a: Any, b: Any, beta: Any, floor: Any):
+    """Return the gains x, y, v of two overlapping slabs, a.z <= b.z (section 3.2.1, eq. 4)."""
+    one = type(beta)(1.0)
+    a0, a1, b0, b1, b2 = relative_lengths(a, b)
+    power_a = power(a, a0, floor)
+    power_b0 = power(b, b0, floor)
+    power_b1 = power(b, one - b2, floor)
+    x = beta * a1 + (one - beta) * optical_gain(a, a0, one, power_a, a.t)
+    y = beta * b1 + (one - beta) * optical_gain(b, b0, one - b2, power_b0, power_b1)
+    v = beta * b2 + (one - beta) * optical_gain(b, one - b2, one, power_b1, b.t)
+    return x, y, v
+
+
+@wp.func
+def boundary_adjoint(g: Any, s: Any, r: Any, power_r: Any, floor: Any):
+    """Return gradients in r and in the slab's a, t, l of <g, A(r)/A>, optical model; power_r is T^r."""
+    zero = type(g)(0.0)
+    g_r = zero
+    g_a = zero
+    g_t = zero
+    g_l = zero
+    if r > zero:
+        if s.a < type(g)(SERIES_OPACITY):
+            series_a, series_r = series_gradient(s.a, r)
+            g_a = g * series_a
+            g_r = g * series_r
+        else:
+            g_power = -g / s.a
+            g_a = g_power * (type(g)(1.0) - power_r) / s.a
+            if r >= type(g)(1.0) and s.l < floor:
+                g_t = g_power
+            else:
+                g_r = g_power * power_r * wp.max(s.l, floor)
+                if s.l > floor:
+                    g_l = g_power * power_r * r
+    return g_r, g_a, g_t, g_l
+
+
+@wp.func
+def add_gains_gradient(s: Any, g: Any):
+    """Return the sum of two gradients, of which the second has no colour and weight."""
+    return slab(s.c, s.a + g.a, s.t + g.t, s.l + g.l, s.w, s.f + g.f, s.z + g.z)
+
+
+@wp.func
+def smooth_gains_adjoint(g_x: Any, g_y: Any, g_v: Any, a: Any, b: Any, beta: Any, floor: Any):
+    """Return gradients in a and b, of which colour and weight are 0, and in beta."""
+    one = type(beta)(1.0)
+    zero = type(beta)(0.0)
+    optical = one - beta
+    a0, a1, b0, b1, b2 = relative_lengths(a, b)
+    power_a = power(a, a0, floor)
+    power_b0 = power(b, b0, floor)
+    power_b1 = power(b, one - b2, floor)
+    g_beta = (
+        g_x * (a1 - optical_gain(a, a0, one, power_a, a.t))
+        + g_y * (b1 - optical_gain(b, b0, one - b2, power_b0, power_b1))
+        + g_v * (b2 - optical_gain(b, one - b2, one, power_b1, b.t))
+    )
+    # x = beta a1 + (1 - beta) (1 - gain up to a0), and so on: first the optical terms, then the lengths.
+    g_a0, g_aa, g_at, g_al = boundary_adjoint(-optical * g_x, a, a0, power_a, floor)
+    g_b0, g_ba, g_bt, g_bl = boundary_adjoint(-optical * g_y, b, b0, power_b0, floor)
+    g_r1, g_ba1, g_bt1, g_bl1 = boundary_adjoint(optical * (g_y - g_v), b, one - b2, power_b1, floor)
+    g_a1 = beta * g_x
+    g_b1 = beta * g_y
+    g_b2 = beta * g_v - g_r1
+    per_b = one / (b.z - b.f)
+    g_length_b = -(g_b0 * b0 + g_b1 * b1 + g_b2 * b2) * per_b
+    g_inner = (g_b0 - g_b1) * per_b
+    g_af = zero
+    g_az = (g_b1 - g_b2) * per_b
+    g_bf = -g_b0 * per_b - g_length_b
+    g_bz = g_b2 * per_b + g_length_b
+    if a.z > a.f:
+        per_a = one / (a.z - a.f)
+        g_length_a = -(g_a0 * a0 + g_a1 * a1) * per_a
+        g_inner += (g_a0 - g_a1) * per_a
+        g_af = -g_a0 * per_a - g_length_a
+        g_az += g_a1 * per_a + g_length_a
+    if a.f > b.f:
+        g_af += g_inner
+    else:
+        g_bf += g_inner
+    none = wp.vector(zero, zero, zero)
+    g_a = slab(none, g_aa, g_at, g_al, zero, g_af, g_az)
+    g_b = slab(none, g_ba + g_ba1, g_bt + g_bt1, g_bl + g_bl1, zero, g_bf, g_bz)
+    return g_a, g_b, g_beta
+
+
+@wp.func
+def mix_weights(a: Any, b: Any, x: Any, y: Any, d_a: Any, d_1: Any, d_2: Any, mix: int):
+    """Return the weights of the parts' colours in a mix, and whether opaque parts fixed them (then they add up to 1)."""
+    zero = type(x)(0.0)
+    one = type(x)(1.0)
+    half = type(x)(0.5)
+    if mix == MIX_OPTICAL_DEPTH:
+        t_a = divide(a.t, d_a, zero)
+        t_b = divide(d_2, d_1, zero)
+        # Opaque parts win; two of them are averaged.
+        if t_a <= zero and t_b <= zero:
+            return half, half, True
+        if t_a <= zero:
+            return one, zero, True
+        if t_b <= zero:
+            return zero, one, True
+        return depth_per_opacity(a.a * x / d_a, t_a), depth_per_opacity(b.a * y / d_1, t_b), False
+    return a.w, b.w, False
+
+
+@wp.func
+def merge(a: Any, b: Any, x: Any, y: Any, v: Any, mix: int):
+    """Return the slab that a and b become, given their gains (section 3.2; mix: eq. 6-8, zSlab eq. 4.1-4.4)."""
+    one = type(x)(1.0)
+    zero = type(x)(0.0)
+    d_a = a.t + a.a * x
+    d_2 = b.t + b.a * v
+    d_1 = d_2 + b.a * y
+    x_a = a.a * x
+    y_b = b.a * y
+    if mix == MIX_AVERAGE:
+        mixed_a = x * (d_1 - type(x)(0.5) * y_b)
+        mixed_b = y * (d_a - type(x)(0.5) * x_a)
+    else:
+        v_a, v_b, opaque = mix_weights(a, b, x, y, d_a, d_1, d_2, mix)
+        total = d_1 * x_a * v_a + d_a * y_b * v_b
+        scale = one
+        if total > zero and not opaque:
+            scale = (d_1 * x_a + a.t * y_b) / total
+        mixed_a = d_1 * x * v_a * scale
+        mixed_b = d_a * y * v_b * scale
+    share_a = one - x + mixed_a
+    share_b = one - y - v + mixed_b + a.t * v
+    sum_a = one - x + divide(x, d_a, zero)
+    sum_b = one - y - v + divide(y, d_1, zero) + divide(v, d_2, zero)
+    opacity = a.a + a.t * b.a
+    weight = divide(a.a * a.w * sum_a + b.a * b.w * sum_b, opacity, one)
+    c = share_a * a.c + share_b * b.c
     return slab(c, opacity, a.t * b.t, a.l + b.l, weight, wp.min(a.f, b.f), wp.max(a.z, b.z))
 
 
 @wp.func
-def sfm(a: Any, b: Any, beta: Any, mix: int, floor: Any):
-    """Return the smooth merging of two overlapping slabs, a.z <= b.z (section 3.2.1, eq. 4-5).
-
-    The three pieces are one slab's front part alone (`0`), the mix of the rest of a with as much of b (`1`), and the
-    rest of b (`2`). A part's colour and opacity are its share (`gain`) of the slab's, divided by the transmittance
-    `before` of the slab up to it; over multiplies by that again, so the front and last pieces need no division.
-    """
-    one = type(beta)(1.0)
-    zero = type(beta)(0.0)
-    optical = one - beta
-    inner = wp.max(a.f, b.f)
-    # Relative lengths: a = [a0 | a1], b = [b0 | b1 | b2]; a0 = 0 or b0 = 0. A slab without thickness is not divided.
-    a0 = zero
-    a1 = one
-    if a.z > a.f:
-        a0 = (inner - a.f) / (a.z - a.f)
-        a1 = (a.z - inner) / (a.z - a.f)
-    b0 = (inner - b.f) / (b.z - b.f)
-    b1 = (a.z - inner) / (b.z - b.f)
-    b2 = (b.z - a.z) / (b.z - b.f)
-    power_a = power(a, a0, floor)
-    power_b0 = power(b, b0, floor)
-    power_b1 = power(b, one - b2, floor)
-    gain_a0 = beta * a0 + optical * optical_gain(a, zero, a0, one, power_a)
-    gain_a1 = beta * a1 + optical * optical_gain(a, a0, one, power_a, a.t)
-    gain_b0 = beta * b0 + optical * optical_gain(b, zero, b0, one, power_b0)
-    gain_b1 = beta * b1 + optical * optical_gain(b, b0, one - b2, power_b0, power_b1)
-    gain_b2 = beta * b2 + optical * optical_gain(b, one - b2, one, power_b1, b.t)
-    before_a = beta * (a1 + a0 * a.t) + optical * power_a
-    before_b1 = beta * (b1 + b2 + b0 * b.t) + optical * power_b0
-    before_b2 = beta * (b2 + (one - b2) * b.t) + optical * power_b1
-    part_a = divide(gain_a1, before_a, one)
-    part_b = divide(gain_b1, before_b1, wp.where(b1 > zero, one, zero))
-    rest_b = divide(gain_b2, before_b2, wp.where(b2 > zero, one, zero))
-    mixed = mix_color(
-        a.c * part_a,
-        a.a * part_a,
-        divide(a.t, before_a, zero),
-        a.w,
-        b.c * part_b,
-        b.a * part_b,
-        divide(before_b2, before_b1, wp.where(b1 > zero, zero, one)),
-        b.w,
-        mix,
-    )
-    c = a.c * gain_a0 + b.c * gain_b0 + before_a * before_b1 * mixed + a.t * gain_b2 * b.c
+def merge_adjoint(g: Any, a: Any, b: Any, x: Any, y: Any, v: Any, mix: int):
+    """Return gradients in a, b, x, y and v. Every local g_n is the gradient in the n of `merge`."""
+    one = type(x)(1.0)
+    zero = type(x)(0.0)
+    half = type(x)(0.5)
+    d_a = a.t + a.a * x
+    d_2 = b.t + b.a * v
+    d_1 = d_2 + b.a * y
+    x_a = a.a * x
+    y_b = b.a * y
+    # share_a = 1 - x + mixed_a,  share_b = 1 - y - v + mixed_b + T_a v
+    g_share_a = wp.dot(g.c, a.c)
+    g_share_b = wp.dot(g.c, b.c)
+    g_x = -g_share_a
+    g_y = -g_share_b
+    g_v = g_share_b * (a.t - one)
+    g_at = g_share_b * v
+    g_aw = zero
+    g_bw = zero
+    g_d2 = zero
+    if mix == MIX_AVERAGE:
+        mixed_a = x * (d_1 - half * y_b)
+        mixed_b = y * (d_a - half * x_a)
+        g_x += g_share_a * (d_1 - half * y_b)
+        g_y += g_share_b * (d_a - half * x_a)
+        g_d1 = g_share_a * x
+        g_da = g_share_b * y
+        g_yb = -half * g_d1
+        g_xa = -half * g_da
+    else:
+        v_a, v_b, opaque = mix_weights(a, b, x, y, d_a, d_1, d_2, mix)
+        total = d_1 * x_a * v_a + d_a * y_b * v_b
+        scale = one
+        g_part = zero
+        g_total = zero
+        if total > zero and not opaque:
+            scale = (d_1 * x_a + a.t * y_b) / total
+            g_part = (g_share_a * d_1 * x * v_a + g_share_b * d_a * y * v_b) / total
+            g_total = -g_part * scale
+        mixed_a = d_1 * x * v_a * scale
+        mixed_b = d_a * y * v_b * scale
+        g_x += g_share_a * d_1 * v_a * scale
+        g_y += g_share_b * d_a * v_b * scale
+        g_d1 = g_share_a * x * v_a * scale + (g_part + g_total * v_a) * x_a
+        g_da = g_share_b * y * v_b * scale + g_total * v_b * y_b
+        g_xa = (g_part + g_total * v_a) * d_1
+        g_yb = g_part * a.t + g_total * v_b * d_a
+        g_at += g_part * y_b
+        g_va = g_share_a * d_1 * x * scale + g_total * d_1 * x_a
+        g_vb = g_share_b * d_a * y * scale + g_total * d_a * y_b
+        if mix == MIX_OPACITY:
+            g_aw = g_va
+            g_bw = g_vb
+        elif not opaque:
+            part_a, part_ta = depth_per_opacity_gradient(x_a / d_a, a.t / d_a)
+            part_b, part_tb = depth_per_opacity_gradient(y_b / d_1, d_2 / d_1)
+            g_xa += g_va * part_a / d_a
+            g_at += g_va * part_ta / d_a
+            g_da -= g_va * (part_a * x_a + part_ta * a.t) / (d_a * d_a)
+            g_yb += g_vb * part_b / d_1
+            g_d1 -= g_vb * (part_b * y_b + part_tb * d_2) / (d_1 * d_1)
+            g_d2 = g_vb * part_tb / d_1
+    # weight = (A_a w_a sum_a + A_b w_b sum_b) / opacity
+    p = divide(x, d_a, zero)
+    q = divide(y, d_1, zero)
+    r = divide(v, d_2, zero)
+    sum_a = one - x + p
+    sum_b = one - y - v + q + r
     opacity = a.a + a.t * b.a
-    sum = a.a * a.w * (gain_a0 + part_a) + b.a * b.w * (gain_b0 + part_b + rest_b)
-    weight = divide(sum, opacity, one)
-    return slab(c, opacity, a.t * b.t, a.l + b.l, weight, wp.min(a.f, b.f), b.z)
+    weight = divide(a.a * a.w * sum_a + b.a * b.w * sum_b, opacity, one)
+    g_sum = divide(g.w, opacity, zero)
+    g_opacity = g.a - g_sum * weight
+    g_p = divide(g_sum * a.a * a.w, d_a, zero)
+    g_q = divide(g_sum * b.a * b.w, d_1, zero)
+    g_r = divide(g_sum * b.a * b.w, d_2, zero)
+    g_x += g_p - g_sum * a.a * a.w
+    g_y += g_q - g_sum * b.a * b.w
+    g_v += g_r - g_sum * b.a * b.w
+    g_da -= g_p * p
+    g_d1 -= g_q * q
+    g_d2 += g_d1 - g_r * r
+    g_yb += g_d1
+    g_xa += g_da
+    g_x += g_xa * a.a
+    g_y += g_yb * b.a
+    g_v += g_d2 * b.a
+    g_aa = g_opacity + g_sum * a.w * sum_a + g_xa * x
+    g_ba = g_opacity * a.t + g_sum * b.w * sum_b + g_yb * y + g_d2 * v
+    g_at += g_opacity * b.a + g.t * b.t + g_da
+    g_bt = g.t * a.t + g_d2
+    g_aw += g_sum * a.a * sum_a
+    g_bw += g_sum * b.a * sum_b
+    share_a = one - x + mixed_a
+    share_b = one - y - v + mixed_b + a.t * v
+    g_a = slab(share_a * g.c, g_aa, g_at, g.l, g_aw, wp.where(a.f <= b.f, g.f, zero), wp.where(a.z > b.z, g.z, zero))
+    g_b = slab(share_b * g.c, g_ba, g_bt, g.l, g_bw, wp.where(a.f <= b.f, zero, g.f), wp.where(a.z > b.z, zero, g.z))
+    return g_a, g_b, g_x, g_y, g_v

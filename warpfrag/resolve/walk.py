@@ -6,12 +6,22 @@ it fixed. The way back needs the running slab before each step; `replay` recompu
 belongs to the thread, so the forward pass stores nothing for the gradient.
 """
 
-from functools import cache
 from typing import Any
 
 import warp as wp
 
-from warpfrag.operators import log_transmittance, ofm, over, overlap, sfm, slab
+from warpfrag.operators import (
+    add_gains_gradient,
+    log_transmittance,
+    merge,
+    merge_adjoint,
+    over,
+    over_adjoint,
+    overlap,
+    slab,
+    smooth_gains,
+    smooth_gains_adjoint,
+)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -125,9 +135,9 @@ def valid_fragment(rgba: Any, depth: Any, thickness: Any, fragment: int):
 
 
 @wp.func
-def choose_step(running: Any, following: Any, layer: int, max_layers: int, merge: int):
+def choose_step(running: Any, following: Any, layer: int, max_layers: int, merge_kind: int):
     """Return what happens to the slab that follows the running one, which is to become layer number `layer`."""
-    if merge != MERGE_NONE and overlap(running, following):
+    if merge_kind != MERGE_NONE and overlap(running, following):
         return STEP_MERGE
     if layer < max_layers - 1:
         return STEP_START
@@ -135,48 +145,35 @@ def choose_step(running: Any, following: Any, layer: int, max_layers: int, merge
 
 
 @wp.func
-def take_step(step: int, a: Any, b: Any, beta: Any, merge: int, mix: int, floor: Any):
+def take_step(step: int, a: Any, b: Any, beta: Any, merge_kind: int, mix: int, floor: Any):
     """Return the running slab after a step that is not a start."""
     if step == STEP_TAIL:
         return over(a, b)
-    if merge == MERGE_SMOOTH:
-        return sfm(a, b, beta, mix, floor)
-    return ofm(a, b, mix)
+    x = type(beta)(1.0)
+    y = type(beta)(1.0)
+    v = type(beta)(0.0)
+    if merge_kind == MERGE_SMOOTH:
+        x, y, v = smooth_gains(a, b, beta, floor)
+    return merge(a, b, x, y, v, mix)
 
 
 @wp.func
-def pair(g: Any, s: Any):
-    """Return the scalar product of a cotangent with a slab."""
-    return wp.dot(g.c, s.c) + g.a * s.a + g.t * s.t + g.l * s.l + g.w * s.w + g.f * s.f + g.z * s.z
-
-
-@wp.func
-def over_pair(g: Any, a: Any, b: Any):
-    return pair(g, over(a, b))
-
-
-@wp.func
-def ofm_pair(g: Any, a: Any, b: Any, mix: int):
-    return pair(g, ofm(a, b, mix))
-
-
-@wp.func
-def sfm_pair(g: Any, a: Any, b: Any, beta: Any, mix: int, floor: Any):
-    return pair(g, sfm(a, b, beta, mix, floor))
-
-
-@wp.func
-def take_step_back(step: int, g: Any, a: Any, b: Any, beta: Any, merge: int, mix: int, floor: Any):
+def take_step_adjoint(step: int, g: Any, a: Any, b: Any, beta: Any, merge_kind: int, mix: int, floor: Any):
     """Return the gradients in a, b and beta of <g, take_step(step, a, b, ...)>."""
-    # `wp.grad` returns a gradient for every argument; those in g itself, mix and floor are of no use here.
+    zero = type(beta)(0.0)
     if step == STEP_TAIL:
-        over_g, over_a, over_b = wp.grad(over_pair)(g, a, b)
-        return over_a, over_b, type(beta)(0.0)
-    if merge == MERGE_SMOOTH:
-        sfm_g, sfm_a, sfm_b, sfm_beta, sfm_mix, sfm_floor = wp.grad(sfm_pair)(g, a, b, beta, mix, floor)
-        return sfm_a, sfm_b, sfm_beta
-    ofm_g, ofm_a, ofm_b, ofm_mix = wp.grad(ofm_pair)(g, a, b, mix)
-    return ofm_a, ofm_b, type(beta)(0.0)
+        over_a, over_b = over_adjoint(g, a, b)
+        return over_a, over_b, zero
+    x = type(beta)(1.0)
+    y = type(beta)(1.0)
+    v = type(beta)(0.0)
+    if merge_kind == MERGE_SMOOTH:
+        x, y, v = smooth_gains(a, b, beta, floor)
+    merge_a, merge_b, g_x, g_y, g_v = merge_adjoint(g, a, b, x, y, v, mix)
+    if merge_kind != MERGE_SMOOTH:
+        return merge_a, merge_b, zero
+    gains_a, gains_b, g_beta = smooth_gains_adjoint(g_x, g_y, g_v, a, b, beta, floor)
+    return add_gains_gradient(merge_a, gains_a), add_gains_gradient(merge_b, gains_b), g_beta
 
 
 @wp.func
@@ -195,7 +192,7 @@ def replay(
     end: int,
     beta: Any,
     max_layers: int,
-    merge: int,
+    merge_kind: int,
     mix: int,
     floor: Any,
     order: wp.array2d[int],
@@ -215,31 +212,15 @@ def replay(
         following = load_slab(rgba, depth, thickness, opacity_sum, order[row, position])
         step = int(STEP_START)
         if position > 0:
-            step = choose_step(states[row, position - 1], following, layer, max_layers, merge)
+            step = choose_step(states[row, position - 1], following, layer, max_layers, merge_kind)
         if step == STEP_START:
             if position > 0:
                 layer += 1
                 transmittance *= states[row, position - 1].t
             states[row, position] = following
         else:
-            states[row, position] = take_step(step, states[row, position - 1], following, beta, merge, mix, floor)
+            states[row, position] = take_step(step, states[row, position - 1], following, beta, merge_kind, mix, floor)
         steps[row, position] = step
         through[row, position] = transmittance
     return wp.where(end > begin, layer + 1, 0)
 
-
-@cache
-def adjoint_module(name: str, scalar: Any) -> wp.Module:
-    """Return a module for one backward kernel, in which the operators' adjoints exist.
-
-    `wp.grad` asks for the adjoints it needs, but Warp 1.19 leaves out those of functions that the same module has called
-    forward before: gradients come out zero, without a warning. A kernel with backward enabled has them made in any case.
-    """
-    module = wp.get_module(f"warpfrag.{name}.{scalar.__name__}")
-
-    @wp.kernel(module=module, enable_backward=True)
-    def adjoints(out: wp.array(dtype=scalar)):
-        s = zero_slab(out[0])
-        out[0] = over_pair(s, s, s) + ofm_pair(s, s, s, 0) + sfm_pair(s, s, s, out[0], 0, out[0])
-
-    return module

@@ -156,7 +156,7 @@ def _load_trimesh(path: Path, root: Path) -> tuple[list[Mesh], str]:
             factors = _gltf_factors(content) if suffix in (".glb", ".gltf") else []
             images: dict = {}
             parts = []
-            for node in scene.graph.nodes_geometry:
+            for node in _in_file_order(scene, suffix):
                 matrix, geometry = scene.graph[node]
                 part = scene.geometry[geometry]
                 if isinstance(part, trimesh.Trimesh) and len(part.faces):
@@ -171,6 +171,15 @@ def _load_trimesh(path: Path, root: Path) -> tuple[list[Mesh], str]:
         warnings.warn(f"{path}{resolver.complaint()}", stacklevel=4)
     kinds = sorted({type(item).__name__ for item in scene.geometry.values() if not isinstance(item, trimesh.Trimesh)})
     return parts, f" (it holds {', '.join(kinds)})" if kinds else ""
+
+
+def _in_file_order(scene: Any, suffix: str) -> list[str]:
+    """Order the nodes that hold geometry by their mesh's place in the file, then as the scene graph has them."""
+    # trimesh walks graphs, and reads the parts of an obj, from the last to the first.
+    names = list(scene.geometry)
+    place = {name: index for index, name in enumerate(names[::-1] if suffix == ".obj" else names)}
+    nodes = list(scene.graph.nodes_geometry)[::-1]
+    return sorted(nodes, key=lambda node: place[scene.graph[node][1]])
 
 
 def _part(part: Any, matrix: np.ndarray, suffix: str, factors: list, images: dict) -> Mesh:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from warpfrag.extras import need
 from warpfrag.scene.mesh import Mesh, transformed_normals
 
 
@@ -24,10 +25,9 @@ def load_usd(path: Path, root: Path) -> tuple[list[Mesh], str]:
         ValueError: The file cannot be read, or it refers to a file outside of ``root``.
         ImportError: usd-core is not installed.
     """
-    try:
-        from pxr import Tf, Usd, UsdGeom
-    except ImportError as error:
-        raise ImportError("USD files need usd-core: pip install warpfrag[usd]") from error
+    need("pxr", "usd", "Reading USD files")
+    from pxr import Tf, Usd, UsdGeom
+
     try:
         stage = Usd.Stage.Open(str(path))
     except Tf.ErrorException as error:

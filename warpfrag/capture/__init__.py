@@ -1,0 +1,1 @@
+"""Scene to fragments: the dynamic fragment buffer (count, prefix sum, store, sort), then shading."""

@@ -1,0 +1,220 @@
+"""A scene as fragments: what stands in camera space, and which of it each pixel sees."""
+
+from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warpfrag.capture.memory import allowed_memory, fixed_bytes, fragment_bytes, refuse
+from warpfrag.capture.raster import (
+    Triangles,
+    count_fragments,
+    prepare_triangles,
+    scan_counts,
+    sort_fragments,
+    store_fragments,
+)
+from warpfrag.capture.ray import Window
+from warpfrag.capture.shade_adjoint import SHADE
+from warpfrag.fragments import Fragments
+from warpfrag.interop.operator import apply, kind_of
+from warpfrag.scene.camera import Camera
+from warpfrag.scene.geometry import Geometry, assemble
+from warpfrag.scene.objects import Scene
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """All triangles of a scene, seen from a camera: what `shade` interpolates, as arrays of one kind, on one device.
+
+    Attributes:
+        points: camera space [scene units], (V, 3); rgba (V, 4) straight, thickness (V,), maps (maps, H·W) or None.
+        faces: indices into `points`, (N, 3) int32.
+        tables: the index arrays and textures that `shade` takes after `offsets`.
+    """
+
+    points: Any
+    rgba: Any
+    thickness: Any
+    maps: Any
+    faces: wp.array
+    tables: tuple[Any, ...]
+
+    @property
+    def differentiable(self) -> bool:
+        """Whether torch records gradients in any of the arrays."""
+        arrays = [a for a in (self.points, self.rgba, self.thickness, self.maps) if a is not None]
+        if kind_of(self.points) != "torch" or not any(array.requires_grad for array in arrays):
+            return False
+        import torch
+
+        return torch.is_grad_enabled()
+
+    def triangles(self, window: Window) -> Triangles:
+        """Return the triangles as rasterising takes them."""
+        return prepare_triangles(_to_warp(self.points), self.faces, window)
+
+    def stream(self) -> AbstractContextManager[Any]:
+        """Return a context in which kernels run in order with torch's own work on the device."""
+        if kind_of(self.points) != "torch" or self.points.device.type != "cuda":
+            return nullcontext()
+        import torch
+
+        return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(self.points.device)))
+
+
+def place_surfaces(geometry: Geometry, camera: Camera) -> Surfaces:
+    """Take a scene's geometry from world to camera space, and its tables to the device of its arrays."""
+    device = wp.device_from_torch(geometry.vertices.device) if kind_of(geometry.vertices) == "torch" else "cpu"
+    mapped = sorted(geometry.thickness_maps)
+    maps = None
+    if mapped:
+        stack = _namespace(geometry.vertices).stack([geometry.thickness_maps[item] for item in mapped])
+        maps = stack.reshape((len(mapped), camera.shape[0] * camera.shape[1]))
+    objects = np.full((len(geometry.thickness_in_p), 3), -1, np.int32)
+    objects[:, 0] = geometry.first_face[:-1]
+    objects[mapped, 1] = range(len(mapped))
+    objects[:, 2] = geometry.thickness_in_p
+    tables: list[Any] = [geometry.object_id, objects, None, None, None, None]
+    if geometry.uv is not None and len(geometry.textures):
+        sizes = np.array([image.shape[:2] for image in geometry.textures], np.int32)
+        begins = np.cumsum([0, *(len(image) * image.shape[1] for image in geometry.textures)])[:-1]
+        texels = np.concatenate([image.reshape(-1, 4) for image in geometry.textures]).astype(np.float32)
+        tables[2:] = geometry.uv, geometry.texture_id, texels, np.column_stack([begins, sizes]).astype(np.int32)
+    return Surfaces(
+        points=to_camera_space(geometry.vertices, camera),
+        rgba=geometry.rgba,
+        thickness=geometry.thickness,
+        maps=maps,
+        faces=_on_device(geometry.faces, device),
+        tables=tuple(_like(_on_device(table, device), geometry.vertices) for table in tables),
+    )
+
+
+def to_camera_space(vertices: Any, camera: Camera) -> Any:
+    """Return world vertices in camera space, computed in float64 whatever their precision; differentiable in torch.
+
+    Component by component, so that NumPy and torch round alike.
+    """
+    view = camera.view_matrix()
+    xp = _namespace(vertices)
+    double = vertices.astype(np.float64) if xp is np else vertices.double()
+    x, y, z = double[:, 0], double[:, 1], double[:, 2]
+    # Python's own floats: torch would turn NumPy's into arrays.
+    rows = [[float(value) for value in row] for row in view[:3]]
+    points = xp.stack([row[0] * x + row[1] * y + row[2] * z + row[3] for row in rows], 1)
+    return points.astype(vertices.dtype) if xp is np else points.to(vertices.dtype)
+
+
+def fragments_of_rows(surfaces: Surfaces, triangles: Triangles, starts: wp.array, total: int, sort: bool) -> Fragments:
+    """Store, sort and shade what `scan_counts` has counted; turns `starts` into offsets."""
+    window = triangles.window
+    faces, depths = store_fragments(triangles, starts, total, sort)
+    sort_fragments(starts, faces, depths)
+    del depths
+    offsets = _like(starts, surfaces.points)
+    inputs = (
+        *(surfaces.points, surfaces.rgba, surfaces.thickness, surfaces.maps),
+        *(_like(triangles.corners, surfaces.points), _like(faces, surfaces.points), offsets, *surfaces.tables),
+    )
+    rgba, depth, thickness, object_id, primitive_id = apply(SHADE, inputs, **asdict(window))
+    shape = (window.row_count, window.width)
+    return Fragments(rgba, depth, thickness, offsets, shape, object_id=object_id, primitive_id=primitive_id)
+
+
+def capture(
+    scene: Scene,
+    camera: Camera | None = None,
+    *,
+    sort: bool = True,
+    parameters: Mapping[str, Any] | None = None,
+    rows: tuple[int, int] | None = None,
+    memory_limit: float | None = None,
+) -> Fragments:
+    """Capture every surface that a pixel's ray meets as a fragment (the dynamic fragment buffer).
+
+    A triangle covers a pixel if the pixel's centre lies in its projection: by the top-left rule on edges, from both sides, between
+    the near and far planes. Differentiable in vertices, colour, opacity and thickness; which pixels a triangle covers, the
+    order of the fragments and the texels that a lookup takes are held fixed.
+
+    Args:
+        scene: what to capture.
+        camera: where from; default the scene's.
+        sort: order of a pixel's fragments: by (depth, object, primitive), or as submitted, by (object, primitive).
+        parameters: values in place of the scene's own, by the names of `scene.parameters()`: numbers, NumPy arrays, or
+            torch tensors, in which the fragments are then differentiable. `"beta"` is not used here.
+        rows: capture only these rows [begin, end) of the image; default all.
+        memory_limit: most memory that fragments and their gradients may take [bytes]; default half of what is free.
+
+    Returns:
+        Fragments of shape (H, W), or (end - begin, W), with object and primitive ids; torch tensors if any parameter is
+        one, else NumPy arrays; float64 if any parameter is an array of that, else float32.
+
+    Raises:
+        TypeError: an argument is of the wrong type.
+        ValueError: an argument is out of its range.
+        MemoryError: there would be more fragments than the limit allows; nothing has been stored yet.
+
+    Example:
+        >>> wf.capture(wf.load_scene("scenes/three_spheres.toml")).shape
+        (512, 512)
+    """
+    camera = check_scene(scene, camera)
+    window = Window.of(camera, _check_rows(rows, camera))
+    surfaces = place_surfaces(assemble(scene, parameters, camera=camera), camera)
+    with surfaces.stream():
+        triangles = surfaces.triangles(window)
+        allowed = allowed_memory(memory_limit, triangles.device)
+        starts, total = scan_counts(count_fragments(triangles))
+        gradient = surfaces.differentiable
+        needed = fixed_bytes(triangles, gradient) + total * fragment_bytes(triangles.points.dtype, gradient)
+        if needed > allowed:
+            refuse(needed, allowed, f"{total} fragments")
+        return fragments_of_rows(surfaces, triangles, starts, total, sort)
+
+
+def check_scene(scene: Any, camera: Any) -> Camera:
+    """Return the camera to use, once both arguments are checked."""
+    if not isinstance(scene, Scene):
+        raise TypeError(f"scene: got {type(scene).__name__}, expected a Scene (load_scene reads one from a file)")
+    if camera is not None and not isinstance(camera, Camera):
+        raise TypeError(f"camera: got {type(camera).__name__}, expected a Camera")
+    return camera or scene.camera
+
+
+def _check_rows(rows: Any, camera: Camera) -> tuple[int, int]:
+    height = camera.shape[0]
+    if rows is None:
+        return 0, height
+    begin, end = rows
+    if not all(isinstance(row, (int, np.integer)) for row in (begin, end)) or not 0 <= begin <= end <= height:
+        raise ValueError(f"rows: got {rows!r}, expected whole numbers (begin, end) with 0 <= begin <= end <= {height}")
+    return int(begin), int(end)
+
+
+def _namespace(array: Any) -> Any:
+    if kind_of(array) == "torch":
+        import torch
+
+        return torch
+    return np
+
+
+def _on_device(table: np.ndarray | None, device: Any) -> wp.array | None:
+    return None if table is None else wp.array(np.ascontiguousarray(table), device=device, copy=False)
+
+
+def _like(array: wp.array | None, like: Any) -> Any:
+    """Return a Warp array as the kind of another one, sharing its memory."""
+    if array is None:
+        return None
+    return wp.to_torch(array) if kind_of(like) == "torch" else array.numpy()
+
+
+def _to_warp(array: Any) -> wp.array:
+    if kind_of(array) == "torch":
+        return wp.from_torch(array.detach().contiguous())
+    return wp.array(np.ascontiguousarray(array), device="cpu", copy=False)

@@ -1,0 +1,180 @@
+"""Shading: the colour, opacity, depth and z-thickness of fragments, interpolated from the corners of their triangles.
+
+    E = edge functions of the pixel's ray;  l_i = E_i / sum E          (perspective-correct barycentric coordinates)
+    z = sum l_i z_i;                        depth = z |ray direction|
+    A = (sum l_i A_i) m_A;                  C = A (sum l_i c_i) m_c    (m: texel at sum l_i uv_i, bilinear; 1 without)
+    t = sum l_i t_i, or the map's pixel;    times P(depth) where t is given in multiples of that
+
+Differentiable in the corners' positions, colour, opacity and thickness and in the thickness maps. Held fixed: which pixels a
+triangle covers, the order of the fragments, and which four texels a lookup takes (its place between them is not).
+Everything is computed in float64 and stored in the precision of the inputs.
+"""
+
+from collections.abc import Sequence
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from warpfrag.capture.precision import DEPTH_STEP, depth_resolution
+from warpfrag.capture.ray import (
+    ONE,
+    ZERO,
+    Rays,
+    Window,
+    centre_x,
+    centre_y,
+    edge_functions,
+    load_point,
+    planar_depth,
+    seen_from,
+    stretch,
+)
+from warpfrag.capture.texture import load_rgba, load_uv, look_up, mix3, texel_between
+from warpfrag.interop.launch import Span, launch
+
+wp.set_module_options({"enable_backward": False})
+
+# Columns of the table of objects.
+OBJECT_FIRST_FACE = wp.constant(0)
+OBJECT_MAP = wp.constant(1)
+OBJECT_IN_P = wp.constant(2)
+
+SHADE_TENSORS = (
+    *("points", "rgba", "thickness", "maps", "corners", "fragment_face", "offsets", "object_id", "objects"),
+    *("uv", "texture_id", "texels", "textures"),
+)
+SHADE_DIFFERENTIABLE = ("points", "rgba", "thickness", "maps")
+SHADE_OUTPUTS = ("rgba", "depth", "thickness", "object_id", "primitive_id")
+SHADE_OPTIONS = {
+    **{"scale": "float", "perspective": "int", "near": "float", "far": "float"},
+    **{"width": "int", "height": "int", "first_row": "int", "row_count": "int"},
+}
+
+
+@wp.func
+def hit_weights(
+    a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, x: wp.float64, y: wp.float64, scale: wp.float64, perspective: int
+) -> wp.vec3d:
+    """Return the barycentric coordinates of b and c, and the planar depth, where the ray meets the triangle."""
+    e = edge_functions(
+        seen_from(a, x, y, scale, perspective),
+        seen_from(b, x, y, scale, perspective),
+        seen_from(c, x, y, scale, perspective),
+    )
+    total = e[0] + e[1] + e[2]
+    return wp.vec3d(e[1] / total, e[2] / total, planar_depth(e, a[2], b[2], c[2]))
+
+
+@wp.func
+def premultiplied(l_b: wp.float64, l_c: wp.float64, a: wp.vec4d, b: wp.vec4d, c: wp.vec4d, texel: wp.vec4d) -> wp.vec4d:
+    """Interpolate straight colour and opacity, multiply them with the texel, and the colour with the opacity."""
+    s = wp.cw_mul(mix3(a, b, c, l_b, l_c), texel)
+    return wp.vec4d(s[0] * s[3], s[1] * s[3], s[2] * s[3], s[3])
+
+
+@wp.func
+def thickness_scale(depth: wp.float64, in_p: int, near: wp.float64, far: wp.float64) -> wp.float64:
+    """Return the unit of a thickness: 1, or P(depth)."""
+    if in_p != 0:
+        return depth_resolution(depth, near, far, DEPTH_STEP)
+    return ONE
+
+
+@cache
+def _forward_kernel(scalar: Any) -> wp.Kernel:
+    @wp.kernel(module="unique", enable_backward=False)
+    def shade_fwd(
+        span: Span,
+        rays: Rays,
+        points: wp.array2d(dtype=scalar),
+        rgba: wp.array2d(dtype=scalar),
+        thickness: wp.array(dtype=scalar),
+        maps: wp.array2d(dtype=scalar),
+        corners: wp.array2d(dtype=int),
+        fragment_face: wp.array(dtype=int),
+        offsets: wp.array(dtype=int),
+        object_id: wp.array(dtype=int),
+        objects: wp.array2d(dtype=int),
+        uv: wp.array2d(dtype=float),
+        texture_id: wp.array(dtype=int),
+        texels: wp.array2d(dtype=float),
+        textures: wp.array2d(dtype=int),
+        fragment_rgba: wp.array2d(dtype=scalar),
+        fragment_depth: wp.array(dtype=scalar),
+        fragment_thickness: wp.array(dtype=scalar),
+        fragment_object: wp.array(dtype=int),
+        fragment_primitive: wp.array(dtype=int),
+    ):
+        for pixel in range(span.begin + wp.tid(), span.end, span.stride):
+            row = pixel // rays.width
+            column = pixel - row * rays.width
+            x = centre_x(rays, column)
+            y = centre_y(rays, row)
+            along = stretch(x, y, rays.scale, rays.perspective)
+            for fragment in range(offsets[pixel], offsets[pixel + 1]):
+                face = fragment_face[fragment]
+                i = corners[face, 0]
+                j = corners[face, 1]
+                k = corners[face, 2]
+                hit = hit_weights(
+                    load_point(points, i), load_point(points, j), load_point(points, k),
+                    x, y, rays.scale, rays.perspective,
+                )  # fmt: skip
+                texel = wp.vec4d(ONE, ONE, ONE, ONE)
+                if texture_id.shape[0] > 0:
+                    texture = texture_id[face]
+                    if texture >= 0:
+                        uv_i = load_uv(uv, i)
+                        uv_j = load_uv(uv, j)
+                        uv_k = load_uv(uv, k)
+                        at = look_up(texels, textures, texture, mix3(uv_i, uv_j, uv_k, hit[0], hit[1]))
+                        texel = texel_between(hit[0], hit[1], uv_i, uv_j, uv_k, at)
+                shaded = premultiplied(
+                    hit[0], hit[1], load_rgba(rgba, i), load_rgba(rgba, j), load_rgba(rgba, k), texel
+                )
+                depth = hit[2] * along
+                item = object_id[face]
+                own = mix3(wp.float64(thickness[i]), wp.float64(thickness[j]), wp.float64(thickness[k]), hit[0], hit[1])
+                if objects[item, OBJECT_MAP] >= 0:
+                    own = wp.float64(maps[objects[item, OBJECT_MAP], rays.first_row * rays.width + pixel])
+                own *= thickness_scale(depth, objects[item, OBJECT_IN_P], rays.near, rays.far)
+                for channel in range(3):
+                    fragment_rgba[fragment, channel] = scalar(shaded[channel])
+                # Rounding may leave an interpolated value just outside its range.
+                fragment_rgba[fragment, 3] = scalar(wp.clamp(shaded[3], ZERO, ONE))
+                fragment_depth[fragment] = scalar(depth)
+                fragment_thickness[fragment] = scalar(wp.max(own, ZERO))
+                fragment_object[fragment] = item
+                fragment_primitive[fragment] = face - objects[item, OBJECT_FIRST_FACE]
+
+    return shade_fwd
+
+
+def shade_output_like(inputs: Sequence[Any], **options: Any) -> list[tuple[tuple[int, ...], str]]:
+    """Return the shapes and kinds of `SHADE_OUTPUTS`."""
+    count = inputs[5].shape[0]
+    return [((count, 4), "float"), ((count,), "float"), ((count,), "float"), ((count,), "int32"), ((count,), "int32")]
+
+
+def present(inputs: Sequence[wp.array | None]) -> list[wp.array]:
+    """Return the inputs `SHADE_TENSORS` with empty arrays in place of None: kernels skip those."""
+    points = inputs[0]
+    kinds = {"maps": (2, points.dtype), "uv": (2, wp.float32), "texture_id": (1, wp.int32)}
+    kinds |= {"texels": (2, wp.float32), "textures": (2, wp.int32)}
+    arrays = []
+    for name, array in zip(SHADE_TENSORS, inputs, strict=True):
+        if array is None:
+            ndim, dtype = kinds[name]
+            array = wp.empty((0,) * ndim, dtype=dtype, device=points.device)
+        arrays.append(array)
+    return arrays
+
+
+def shade_forward(inputs: Sequence[wp.array | None], outputs: Sequence[wp.array], **options: Any) -> None:
+    """Shade the fragments: `inputs` are `SHADE_TENSORS`, `outputs` `SHADE_OUTPUTS`, `options` those of a `Window`."""
+    arguments = present(inputs)
+    if outputs[0].shape[0]:
+        window = Window(**options)
+        kernel = _forward_kernel(arguments[0].dtype)
+        launch(kernel, window.pixel_count, [window.rays(), *arguments, *outputs], arguments[0].device)

@@ -1,0 +1,151 @@
+"""Bounded nonlinear least squares: SciPy's trust-region reflective method on compressed residuals.
+
+SciPy cannot stop in the middle and go on later. But it is deterministic, and what it asks for is small once compressed
+(see `jacobian`): all evaluations are kept, and a resumed fit runs SciPy again from the start, answered from memory
+until it comes to where it was. So an unbroken and a resumed fit end at the same bits.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from warpfrag.extras import need
+from warpfrag.fit.jacobian import Compressed, Evaluation
+from warpfrag.fit.losses import RobustLoss
+from warpfrag.fit.outcome import Outcome
+from warpfrag.fit.problem import Problem
+from warpfrag.fit.session import FitError, Session, check_finite
+
+# Random starts keep this share of the range away from the bounds.
+_MARGIN = 0.1
+_REASONS = {
+    0: "the largest number of steps was reached",
+    1: "the gradient vanished",
+    2: "the loss stopped changing",
+    3: "the parameters stopped changing",
+    4: "loss and parameters stopped changing",
+}
+
+
+class _Memory:
+    """All evaluations by coordinates: cost, and the compressed Jacobian where it was asked for."""
+
+    def __init__(self, problem: Problem, session: Session, loss: RobustLoss) -> None:
+        self.problem, self.session, self.loss = problem, session, loss
+        self.costs: dict[bytes, float] = {}
+        self.jacobians: dict[bytes, np.ndarray] = {}
+        self.kept: tuple[bytes, Evaluation] | None = None
+        state = session.state
+        if state:
+            keys = [np.asarray(x).tobytes() for x in state["coordinates"].cpu().numpy()]
+            self.costs = dict(zip(keys, state["costs"].tolist(), strict=True))
+            self.jacobians = {
+                keys[i]: j for i, j in zip(state["jacobian_of"].tolist(), state["jacobians"].cpu().numpy(), strict=True)
+            }
+        self.recorded = set(self.costs)
+
+    def state(self) -> dict[str, Any]:
+        """Return everything as tensors."""
+        import torch
+
+        keys = list(self.costs)
+        count = len(np.frombuffer(keys[0])) if keys else 0
+        order = {key: index for index, key in enumerate(keys)}
+        jacobians = np.stack(list(self.jacobians.values())) if self.jacobians else np.zeros((0, count + 2, count))
+        return {
+            "coordinates": torch.tensor(np.stack([np.frombuffer(key) for key in keys])),
+            "costs": torch.tensor(list(self.costs.values()), dtype=torch.float64),
+            "jacobian_of": torch.tensor([order[key] for key in self.jacobians], dtype=torch.int64),
+            "jacobians": torch.tensor(jacobians),
+        }
+
+    def evaluate(self, coordinates: np.ndarray) -> Evaluation:
+        """Return the image at some coordinates, once if asked twice in a row."""
+        key = coordinates.tobytes()
+        if self.kept is None or self.kept[0] != key:
+            # Freed before the next is made: each holds as many fragments as the scene has.
+            self.kept = None
+            self.kept = key, Evaluation(self.problem, self.loss, coordinates)
+        return self.kept[1]
+
+    def residuals(self, coordinates: np.ndarray) -> np.ndarray:
+        """Return the compressed residuals."""
+        key = coordinates.tobytes()
+        values = self.problem.values(coordinates)
+        step = len(self.session.losses) + 1
+        if key not in self.costs:
+            cost = self._checked(step, values, lambda: self.evaluate(coordinates).cost)
+            check_finite(step, cost, values)
+            self.costs[key] = cost
+            self.session.step(cost * self.loss.factor, values, self.state)
+        else:
+            self.session.losses.append(self.costs[key] * self.loss.factor)
+        residuals = np.zeros(coordinates.size + 2)
+        residuals[0] = np.sqrt(self.costs[key])
+        return residuals
+
+    def jacobian(self, coordinates: np.ndarray) -> np.ndarray:
+        """Return the compressed Jacobian."""
+        key = coordinates.tobytes()
+        if key not in self.jacobians:
+            step, values = len(self.session.losses), self.problem.values(coordinates)
+            found = self._checked(step, values, lambda: self.evaluate(coordinates).compress())
+            names = [v.name for v in self.problem.study.variables for _ in range(v.start.size)]
+            columns = dict(zip(names, np.abs(found.jacobian).max(axis=0), strict=True))
+            check_finite(step, found.cost * self.loss.factor, values, columns)
+            self.jacobians[key] = found.jacobian
+        return self.jacobians[key]
+
+    def _checked(self, step: int, values: dict[str, Any], evaluate: Any) -> Any:
+        try:
+            return evaluate()
+        except ValueError as error:
+            check_finite(step, float("nan"), values)
+            raise FitError(f"step {step}: {error}") from error
+
+
+def least_squares(problem: Problem, session: Session) -> Outcome:
+    """Fit by least squares.
+
+    Args:
+        problem: what to fit; every parameter global.
+        session: the course of the fit; what is in its state is gone through again without computing.
+    """
+    optimize = need("scipy.optimize", "fit", "Least squares")
+    study = problem.study
+    loss = RobustLoss.named(study.loss, study.delta)
+    memory = _Memory(problem, session, loss)
+    lower, upper = problem.bounds()
+    best: Any = None
+    for start in _starts(problem, lower, upper):
+        # SciPy moves a start on a bound into the inside by itself.
+        found = optimize.least_squares(
+            memory.residuals,
+            start,
+            memory.jacobian,
+            bounds=(lower, upper),
+            method="trf",
+            x_scale="jac",
+            ftol=study.tolerance or None,
+            xtol=study.tolerance or None,
+            gtol=1e-15,
+            max_nfev=study.steps,
+        )
+        if best is None or found.cost < best.cost:
+            best = found
+    jacobian = memory.jacobian(best.x)
+    session.state = memory.state()
+    converged = best.status > 0
+    compressed = Compressed(memory.costs[best.x.tobytes()], jacobian)
+    return Outcome(
+        best.x, compressed.cost * loss.factor, converged, _REASONS[best.status], len(memory.costs), compressed
+    )
+
+
+def _starts(problem: Problem, lower: np.ndarray, upper: np.ndarray) -> list[np.ndarray]:
+    generator = np.random.default_rng(problem.study.seed)
+    starts = [np.clip(problem.start(), lower, upper)]
+    for _ in range(problem.study.restarts):
+        share = generator.uniform(_MARGIN, 1.0 - _MARGIN, lower.shape)
+        starts.append(lower + share * (upper - lower))
+    return starts

@@ -1,0 +1,203 @@
+"""The course of a fit: its history, checkpoints, progress reports, and what Ctrl-C does.
+
+A checkpoint is written every few seconds and at every end, under another name first, so that one is always whole. It
+holds the method's state and a fingerprint of the study: a resumed fit goes through the same numbers as an unbroken one.
+
+The first Ctrl-C lets the running step come to its end, writes a checkpoint and stops; the second stops at once, which
+loses what happened since the last checkpoint.
+"""
+
+import contextlib
+import hashlib
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import numpy as np
+
+from warpfrag.fit.parameters import values_words
+from warpfrag.fit.study import Study
+from warpfrag.saving import replacing
+
+CHECKPOINT = "checkpoint.pt"
+# Of the file's layout; another one is not read.
+_VERSION = 1
+
+
+class FitError(ValueError):
+    """A fit that cannot go on, in one line."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a fit reports after each step.
+
+    Attributes:
+        step: steps done: evaluations of least squares, iterations of the other methods.
+        steps: most steps.
+        loss: the loss of this step.
+        parameters: the values of this step, by name.
+        message: something to tell the user, such as what Ctrl-C has begun.
+    """
+
+    step: int
+    steps: int
+    loss: float
+    parameters: Mapping[str, Any]
+    message: str = ""
+
+
+class Session:
+    """The course of one fit.
+
+    Args:
+        study: the study.
+        fingerprint: of the study, see `fingerprint`.
+        folder: where the checkpoint goes; None writes none.
+        report: called after each step.
+    """
+
+    def __init__(
+        self, study: Study, fingerprint: str, folder: Path | None, report: Callable[[Progress], None] | None
+    ) -> None:
+        self.study, self.fingerprint, self.folder, self.report = study, fingerprint, folder, report
+        self.losses: list[float] = []
+        self.state: dict[str, Any] = {}
+        self.seconds_before = 0.0
+        self.started = self.written = time.monotonic()
+        self.interrupted = False
+
+    @property
+    def seconds(self) -> float:
+        """Time spent on the fit, that before a resume included."""
+        return self.seconds_before + time.monotonic() - self.started
+
+    def load(self) -> None:
+        """Take up the checkpoint.
+
+        Raises:
+            FitError: there is none, it cannot be read, or it belongs to another study.
+        """
+        import torch
+
+        assert self.folder is not None
+        path = self.folder / CHECKPOINT
+        if not path.is_file():
+            raise FitError(f"{path}: found no checkpoint to resume, expected one; start without resume")
+        try:
+            saved = torch.load(path, weights_only=True, map_location=self.study.device)
+            version, state = saved["version"], saved["state"]
+        except Exception as error:
+            raise FitError(f"{path}: found a checkpoint that cannot be read ({type(error).__name__})") from error
+        if version != _VERSION or saved["fingerprint"] != self.fingerprint:
+            expected = "the one of this study (scene, reference, parameters, method); start without resume"
+            raise FitError(f"{path}: found the checkpoint of another study, expected {expected}")
+        self.state, self.seconds_before = state, saved["seconds"]
+
+    def save(self) -> None:
+        """Write the checkpoint."""
+        if self.folder is None:
+            return
+        import torch
+
+        content = {"version": _VERSION, "fingerprint": self.fingerprint, "state": self.state, "seconds": self.seconds}
+        with replacing(self.folder / CHECKPOINT) as partial:
+            torch.save(content, partial)
+        self.written = time.monotonic()
+
+    def step(self, loss: float, values: Mapping[str, Any], state: Callable[[], dict[str, Any]]) -> None:
+        """Take note of a step that is done: history, checkpoint when due, report.
+
+        Args:
+            loss: the loss of the step.
+            values: the parameters of the step.
+            state: returns all that the method needs to go on from here.
+
+        Raises:
+            KeyboardInterrupt: the user asked to stop; the checkpoint is written.
+        """
+        self.losses.append(loss)
+        due = time.monotonic() - self.written >= self.study.checkpoint_seconds
+        if self.folder is not None and (due or self.interrupted):
+            self.state = state()
+            self.save()
+        self.tell(loss, values)
+        if self.interrupted:
+            raise KeyboardInterrupt
+
+    def tell(self, loss: float, values: Mapping[str, Any], message: str = "") -> None:
+        """Report progress."""
+        if self.report is not None:
+            self.report(Progress(len(self.losses), int(self.study.steps or 0), loss, dict(values), message))
+
+    @contextlib.contextmanager
+    def interruptible(self) -> Iterator[None]:
+        """Within the block, the first Ctrl-C waits for the end of the step."""
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+        before = signal.getsignal(signal.SIGINT)
+
+        def stop(number: int, frame: FrameType | None) -> None:
+            # Nothing is lost before the first step is done; and whoever presses twice means now.
+            if self.interrupted or not self.losses:
+                raise KeyboardInterrupt
+            self.interrupted = True
+
+        signal.signal(signal.SIGINT, stop)
+        try:
+            yield
+        finally:
+            signal.signal(signal.SIGINT, before)
+
+
+def check_finite(step: int, loss: float, values: Mapping[str, Any], gradients: Mapping[str, Any] | None = None) -> None:
+    """Raise if the loss, a parameter or a gradient is not finite.
+
+    Raises:
+        FitError: with the step and the parameter.
+    """
+    for kind, group in (("", values), ("the gradient in ", gradients or {})):
+        for name, value in group.items():
+            if not np.isfinite(np.asarray(value, dtype=np.float64)).all():
+                raise FitError(f"step {step}: {kind}{name} is not finite (loss {loss:g})")
+    if not np.isfinite(loss):
+        raise FitError(f"step {step}: the loss is {loss:g} at {values_words(values)}")
+
+
+def fingerprint(study: Study, reference: np.ndarray) -> str:
+    """Return a digest of all that decides the numbers of a fit, but for how long it goes on."""
+    digest = hashlib.sha256()
+
+    def add(*things: Any) -> None:
+        for thing in things:
+            array = isinstance(thing, np.ndarray)
+            digest.update(str((thing.dtype, thing.shape)).encode() if array else repr(thing).encode())
+            if array:
+                digest.update(np.ascontiguousarray(thing).tobytes())
+
+    scene = study.scene
+    add(scene.camera, scene.background, scene.beta, scene.layers, scene.merge, scene.mix, reference)
+    for item in scene.objects:
+        add(item.name, item.thickness_unit, item.faces, item.matrix)
+        for value in (item.vertices, item.color, item.opacity, item.thickness, item.uv, item.texture_index, item.shade):
+            add(None if value is None else np.asarray(value))
+        add(*item.textures)
+    for variable in study.variables:
+        add(variable.name, variable.start, variable.lower, variable.upper, variable.unit, variable.learning_rate)
+    add(
+        study.loss,
+        study.delta,
+        study.method,
+        study.seed,
+        study.restarts,
+        study.learning_rate,
+        study.tolerance,
+        study.device,
+    )
+    return digest.hexdigest()
