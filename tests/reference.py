@@ -179,8 +179,8 @@ def part_share(fragment: Fragment, r0: float, r1: float, beta: float, mix: str) 
     length = r1 - r0
     passed = transmittance_to(fragment, r0, beta, mix)
     if passed.real == 0.0:
-        # Nothing reaches this part, 0/0: infinitely dense, it is opaque where it has any length.
-        return 1.0 if length.real > 0.0 else 0.0
+        # Nothing reaches this part, 0/0. No image can show it; by our choice it adds nothing to the opacity sum.
+        return 0.0
     before = optical_transmittance(fragment, r0, mix)
     optical_depth = slab_optical_depth(fragment, mix)
     if math.isinf(optical_depth.real):

@@ -61,7 +61,7 @@ def test_perspective_mesh_is_watertight(seed, dtype):
 def test_closed_mesh_is_entered_as_often_as_left(mesh):
     """Every ray from outside meets a closed surface an even number of times."""
     camera = perspective((150, 150), 50.0)
-    found = counts_of((mesh.vertices + [0.05, 0.1, 3.0]).astype(np.float32), mesh.faces, camera)
+    found = counts_of((mesh.vertices + np.array([0.05, 0.1, 3.0])).astype(np.float32), mesh.faces, camera)
     assert found.max() >= 2
     assert (found % 2 == 0).all()
 

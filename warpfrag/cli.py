@@ -7,6 +7,7 @@ traceback through. Everything heavy is imported by the command that needs it, so
 import os
 import re
 import sys
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from importlib.metadata import version
@@ -70,8 +71,20 @@ def _quiet() -> None:
     """Keep Warp's notes about devices and compiled modules to itself; must come before its first use."""
     import warp as wp
 
-    # Warnings too: that there is no GPU is none.
-    wp.config.log_level = wp.LOG_ERROR
+    wp.config.log_level = wp.LOG_WARNING
+    # That there is no GPU is told by Warp's native half, straight to the file descriptor: no matter for a warning.
+    sys.stderr.flush()
+    before = os.dup(2)
+    with tempfile.TemporaryFile() as told:
+        os.dup2(told.fileno(), 2)
+        try:
+            wp.init()
+        finally:
+            os.dup2(before, 2)
+            os.close(before)
+        told.seek(0)
+        lines = told.read().decode(errors="replace").splitlines()
+    print(*(line + "\n" for line in lines if "NVIDIA CUDA driver" not in line), sep="", end="", file=sys.stderr)
 
 
 def _show_version(wanted: bool) -> None:

@@ -22,24 +22,30 @@ from warpfrag.interop.operator import Operator, apply
 from warpfrag.resolve.arguments import (
     FRAGMENT_DIFFERENTIABLE,
     FRAGMENT_TENSORS,
+    GRADIENTS,
     MERGE_OPTIONS,
+    PIXELS,
+    SCRATCH,
     Merge,
     Mix,
     Walk,
     as_int32,
     check_options,
     fragment_inputs,
-    slab_type,
+    vectors,
 )
 from warpfrag.resolve.walk import (
     STEP_START,
     choose_step,
     load_slab,
+    pixel_beta,
     replay,
     sort_pixel,
+    step_powers,
     store_grad,
     take_step,
     take_step_adjoint,
+    valid_beta,
     valid_fragment,
     zero_slab,
 )
@@ -141,133 +147,107 @@ _COMPOSITE_LAYERS = Operator(
 @cache
 def _fragments_forward_kernel(scalar: Any) -> wp.Kernel:
     vec3 = wp.types.vector(3, scalar)
+    vec4 = wp.types.vector(4, scalar)
 
     @wp.kernel(module="unique", enable_backward=False)
     def composite_fragments_fwd(
         span: Span,
-        rgba: wp.array2d(dtype=scalar),
-        depth: wp.array(dtype=scalar),
-        thickness: wp.array(dtype=scalar),
-        offsets: wp.array(dtype=int),
-        beta: wp.array(dtype=scalar),
-        opacity_sum: wp.array(dtype=scalar),
-        max_layers: int,
-        merge: int,
-        mix: int,
-        floor: scalar,
-        order: wp.array2d(dtype=int),
+        pixels: PIXELS[scalar],
+        order: wp.array(dtype=int),
+        length: int,
         invalid: wp.array2d(dtype=int),
-        image: wp.array2d(dtype=scalar),
+        image: wp.array(dtype=vec4),
     ):
-        row = span.worker + wp.tid()
+        base = (span.worker + wp.tid()) * length
         for pixel in range(span.begin + wp.tid(), span.end, span.stride):
-            begin = offsets[pixel]
-            end = offsets[pixel + 1]
-            pixel_beta = beta[wp.where(beta.shape[0] > 1, pixel, 0)]
-            if not (pixel_beta >= scalar(0.0) and pixel_beta <= scalar(1.0)):
+            begin = pixels.offsets[pixel]
+            count = pixels.offsets[pixel + 1] - begin
+            beta = pixel_beta(pixels, pixel)
+            if not valid_beta(pixels, pixel):
                 wp.atomic_min(invalid, span.worker, 1, pixel)
-            sort_pixel(depth, thickness, begin, end, order, row)
+            sort_pixel(pixels, begin, count, order, base)
             running = zero_slab(scalar(0.0))
             running.t = scalar(1.0)
             color = vec3()
-            transmittance = scalar(1.0)
+            through = scalar(1.0)
             layer = int(0)
-            for position in range(end - begin):
-                fragment = order[row, position]
-                if not valid_fragment(rgba, depth, thickness, fragment):
+            for position in range(count):
+                fragment = order[base + position]
+                if not valid_fragment(pixels, fragment):
                     wp.atomic_min(invalid, span.worker, 0, fragment)
-                following = load_slab(rgba, depth, thickness, opacity_sum, fragment)
-                if position == 0:
+                following = load_slab(pixels, fragment)
+                step = int(STEP_START)
+                if position > 0:
+                    step = choose_step(pixels, running, following, layer)
+                if step == STEP_START:
+                    color += through * running.c
+                    through *= running.t
+                    layer += wp.where(position > 0, 1, 0)
                     running = following
                 else:
-                    step = choose_step(running, following, layer, max_layers, merge)
-                    if step == STEP_START:
-                        color += transmittance * running.c
-                        transmittance *= running.t
-                        running = following
-                        layer += 1
-                    else:
-                        running = take_step(step, running, following, pixel_beta, merge, mix, floor)
-            color += transmittance * running.c
-            image[pixel, 0] = color[0]
-            image[pixel, 1] = color[1]
-            image[pixel, 2] = color[2]
-            image[pixel, 3] = scalar(1.0) - transmittance * running.t
+                    front, back = step_powers(pixels, step, running, following)
+                    running = take_step(pixels, step, running, following, beta, front, back)
+            color += through * running.c
+            image[pixel] = vec4(color[0], color[1], color[2], scalar(1.0) - through * running.t)
 
     return composite_fragments_fwd
 
 
 @cache
 def _fragments_backward_kernel(scalar: Any) -> wp.Kernel:
-    Slab = slab_type(scalar)
     vec3 = wp.types.vector(3, scalar)
+    vec4 = wp.types.vector(4, scalar)
 
     @wp.kernel(module="unique", enable_backward=False)
     def composite_fragments_bwd(
         span: Span,
-        rgba: wp.array2d(dtype=scalar),
-        depth: wp.array(dtype=scalar),
-        thickness: wp.array(dtype=scalar),
-        offsets: wp.array(dtype=int),
-        beta: wp.array(dtype=scalar),
-        opacity_sum: wp.array(dtype=scalar),
-        max_layers: int,
-        merge: int,
-        mix: int,
-        floor: scalar,
-        order: wp.array2d(dtype=int),
-        steps: wp.array2d(dtype=int),
-        states: wp.array2d(dtype=Slab),
-        through: wp.array2d(dtype=scalar),
-        grad_image: wp.array2d(dtype=scalar),
-        grad_rgba: wp.array2d(dtype=scalar),
-        grad_depth: wp.array(dtype=scalar),
-        grad_thickness: wp.array(dtype=scalar),
-        grad_beta: wp.array(dtype=scalar),
-        grad_opacity_sum: wp.array(dtype=scalar),
+        pixels: PIXELS[scalar],
+        scratch: SCRATCH[scalar],
+        grad_image: wp.array(dtype=vec4),
+        grads: GRADIENTS[scalar],
     ):
-        row = span.worker + wp.tid()
+        base = (span.worker + wp.tid()) * scratch.length
         for pixel in range(span.begin + wp.tid(), span.end, span.stride):
-            begin = offsets[pixel]
-            count = offsets[pixel + 1] - begin
-            pixel_beta = beta[wp.where(beta.shape[0] > 1, pixel, 0)]
-            replay(
-                rgba, depth, thickness, opacity_sum, begin, begin + count, pixel_beta, max_layers, merge, mix, floor,
-                order, steps, states, through, row,
-            )  # fmt: skip
-            g = vec3(grad_image[pixel, 0], grad_image[pixel, 1], grad_image[pixel, 2])
+            count = pixels.offsets[pixel + 1] - pixels.offsets[pixel]
+            beta = pixel_beta(pixels, pixel)
+            replay(pixels, pixel, scratch, base)
+            g_color = vec3(grad_image[pixel][0], grad_image[pixel][1], grad_image[pixel][2])
+            g_opacity = grad_image[pixel][3]
             behind = vec3()
-            transmittance_behind = scalar(1.0)
-            grad = zero_slab(scalar(0.0))
-            beta_sum = scalar(0.0)
+            through_behind = scalar(1.0)
+            g = zero_slab(scalar(0.0))
+            g_beta = scalar(0.0)
             ends_layer = bool(True)
             for back in range(count):
-                position = count - 1 - back
-                fragment = order[row, position]
-                step = steps[row, position]
+                at = base + count - 1 - back
+                step = scratch.step[at]
                 if ends_layer:
-                    layer = states[row, position]
-                    t = through[row, position]
-                    grad = zero_slab(scalar(0.0))
-                    grad.c = t * g
-                    grad.t = t * (wp.dot(g, behind) - grad_image[pixel, 3] * transmittance_behind)
+                    layer = scratch.running[at]
+                    through = scratch.through[at]
+                    g = zero_slab(scalar(0.0))
+                    g.c = through * g_color
+                    g.t = through * (wp.dot(g_color, behind) - g_opacity * through_behind)
                     behind = layer.c + layer.t * behind
-                    transmittance_behind *= layer.t
+                    through_behind *= layer.t
                 ends_layer = step == STEP_START
-                grad_fragment = grad
+                g_fragment = g
                 if step != STEP_START:
-                    following = load_slab(rgba, depth, thickness, opacity_sum, fragment)
-                    grad_running, grad_following, grad_step = take_step_adjoint(
-                        step, grad, states[row, position - 1], following, pixel_beta, merge, mix, floor
+                    g_running, g_following, g_step = take_step_adjoint(
+                        pixels,
+                        step,
+                        g,
+                        scratch.running[at - 1],
+                        scratch.fragment[at],
+                        beta,
+                        scratch.front[at],
+                        scratch.back[at],
                     )
-                    grad = grad_running
-                    grad_fragment = grad_following
-                    beta_sum += grad_step
-                store_grad(
-                    grad_fragment, fragment, rgba, opacity_sum, grad_rgba, grad_depth, grad_thickness, grad_opacity_sum
-                )
-            if grad_beta.shape[0] > 0:
-                grad_beta[pixel] = beta_sum
+                    g = g_running
+                    g_fragment = g_following
+                    g_beta += g_step
+                store_grad(g_fragment, pixels, scratch.order[at], grads)
+            if grads.beta.shape[0] > 0:
+                grads.beta[pixel] = g_beta
 
     return composite_fragments_bwd
 
@@ -280,14 +260,14 @@ def _fragments_output_like(
 
 def _fragments_forward(inputs: Sequence[Any], outputs: Sequence[Any], **options: Any) -> None:
     walk = Walk(inputs, **options)
-    walk.forward(_fragments_forward_kernel(walk.scalar), outputs)
+    walk.forward(_fragments_forward_kernel(walk.scalar), [vectors(outputs[0])])
 
 
 def _fragments_backward(
     inputs: Sequence[Any], grad_outputs: Sequence[Any], grad_inputs: Sequence[Any], **options: Any
 ) -> None:
     walk = Walk(inputs, **options)
-    walk.backward(_fragments_backward_kernel(walk.scalar), grad_outputs, grad_inputs)
+    walk.backward(_fragments_backward_kernel(walk.scalar), [vectors(grad_outputs[0])], grad_inputs)
 
 
 _COMPOSITE_FRAGMENTS = Operator(

@@ -65,7 +65,7 @@ class Slab64:
     z: wp.float64
 
 
-@wp.func
+@wp.func(inline=True)
 def slab(c: wp.vec3f, a: float, t: float, l: float, w: float, f: float, z: float) -> Slab32:  # noqa: E741
     s = Slab32()
     s.c = c
@@ -78,7 +78,7 @@ def slab(c: wp.vec3f, a: float, t: float, l: float, w: float, f: float, z: float
     return s
 
 
-@wp.func
+@wp.func(inline=True)
 def slab(  # noqa: F811
     c: wp.vec3d,
     a: wp.float64,
@@ -99,7 +99,7 @@ def slab(  # noqa: F811
     return s
 
 
-@wp.func
+@wp.func(inline=True)
 def log_transmittance(a: Any):
     """Return log(1 - A), or `LOG_OPAQUE` for an opaque slab."""
     t = type(a)(1.0) - a
@@ -108,7 +108,7 @@ def log_transmittance(a: Any):
     return wp.log(t)
 
 
-@wp.func
+@wp.func(inline=True)
 def divide(numerator: Any, denominator: Any, limit: Any):
     """Return the quotient, or its limit where both vanish."""
     if denominator > type(denominator)(0.0):
@@ -116,23 +116,13 @@ def divide(numerator: Any, denominator: Any, limit: Any):
     return limit
 
 
-@wp.func
+@wp.func(inline=True)
 def overlap(a: Any, b: Any):
     """Tell whether two slabs overlap; slabs that only touch do not."""
     return a.z > b.f and b.z > a.f
 
 
-@wp.func
-def power(s: Any, r: Any, floor: Any):
-    """Return T^r, what the front part of relative length r lets through in the optical model (eq. 2)."""
-    if r <= type(r)(0.0):
-        return type(r)(1.0)
-    if r >= type(r)(1.0) and s.l < floor:
-        return s.t
-    return wp.exp(r * wp.max(s.l, floor))
-
-
-@wp.func
+@wp.func(inline=True)
 def series(a: Any, r: Any):
     """Return (1 - (1 - A)^r)/A for small A: the binomial series, to A^6."""
     one = type(a)(1.0)
@@ -143,7 +133,7 @@ def series(a: Any, r: Any):
     return r * sum
 
 
-@wp.func
+@wp.func(inline=True)
 def series_gradient(a: Any, r: Any):
     """Return the derivatives of `series` in A and in r."""
     one = type(a)(1.0)
@@ -159,7 +149,7 @@ def series_gradient(a: Any, r: Any):
     return r * by_a, sum + r * by_r
 
 
-@wp.func
+@wp.func(inline=True)
 def depth_per_opacity(a: Any, t: Any):
     """Return u/A, the optical depth -log(1 - A) per opacity; 1 where A = 0."""
     if a < type(a)(SERIES_OPACITY):
@@ -170,7 +160,7 @@ def depth_per_opacity(a: Any, t: Any):
     return -wp.log(t) / a
 
 
-@wp.func
+@wp.func(inline=True)
 def depth_per_opacity_gradient(a: Any, t: Any):
     """Return the derivatives of `depth_per_opacity` in A and in 1 - A."""
     if a < type(a)(SERIES_OPACITY):
@@ -181,7 +171,7 @@ def depth_per_opacity_gradient(a: Any, t: Any):
     return wp.log(t) / (a * a), type(a)(-1.0) / (t * a)
 
 
-@wp.func
+@wp.func(inline=True)
 def over(a: Any, b: Any):
     """Return slab a over slab b; the slab reaches from a's front to b's back (Algorithm 1, tail handling)."""
     opacity = a.a + a.t * b.a
@@ -189,7 +179,7 @@ def over(a: Any, b: Any):
     return slab(a.c + a.t * b.c, opacity, a.t * b.t, a.l + b.l, weight, a.f, b.z)
 
 
-@wp.func
+@wp.func(inline=True)
 def over_adjoint(g: Any, a: Any, b: Any):
     opacity = a.a + a.t * b.a
     weight = divide(a.a * a.w + b.a * b.w, opacity, type(opacity)(1.0))
@@ -203,120 +193,72 @@ def over_adjoint(g: Any, a: Any, b: Any):
     return g_a, g_b
 
 
-@wp.func
+@wp.func(inline=True)
 def relative_lengths(a: Any, b: Any):
     """Return the lengths of the pieces relative to their slabs, a = [a0 | a1], b = [b0 | b1 | b2]; a0 = 0 or b0 = 0."""
     inner = wp.max(a.f, b.f)
     per_b = type(inner)(1.0) / (b.z - b.f)
     a0 = type(inner)(0.0)
     a1 = type(inner)(1.0)
-    if a.z > a.f:
-        # A slab without thickness is not divided.
+    if a.f < b.f:
         per_a = type(inner)(1.0) / (a.z - a.f)
         a0 = (inner - a.f) * per_a
         a1 = (a.z - inner) * per_a
     return a0, a1, (inner - b.f) * per_b, (a.z - inner) * per_b, (b.z - a.z) * per_b
 
 
-@wp.func
-def optical_gain(s: Any, r0: Any, r1: Any, power0: Any, power1: Any):
+@wp.func(inline=True)
+def sfm_powers(a: Any, b: Any, floor: Any):
+    """Return what the optical model (eq. 2) lets through up to the two cuts of overlapping slabs, a.z <= b.z.
+
+    The front cut lies in the slab that begins first, where the other begins; the back cut in b, where a ends. Apart from
+    the operators because exponentials are dear: the way back reuses them.
+    """
+    a0, a1, b0, b1, b2 = relative_lengths(a, b)
+    # a0 or b0 is zero: one exponential serves both.
+    front = wp.exp(a0 * wp.max(a.l, floor) + b0 * wp.max(b.l, floor))
+    back = wp.exp((type(floor)(1.0) - b2) * wp.max(b.l, floor))
+    if b2 <= type(floor)(0.0) and b.l < floor:
+        back = b.t
+    return front, back
+
+
+@wp.func(inline=True)
+def optical_gain(a: Any, r0: Any, r1: Any, power0: Any, power1: Any):
     """Return (A(r1) - A(r0))/A in the optical model; power0 and power1 are T^r0 and T^r1."""
-    if s.a < type(r0)(SERIES_OPACITY):
-        return series(s.a, r1) - series(s.a, r0)
-    return (power0 - power1) / s.a
+    if a < type(a)(SERIES_OPACITY):
+        return series(a, r1) - series(a, r0)
+    return (power0 - power1) / a
 
 
-@wp.func
-def smooth_gains(a: Any, b: Any, beta: Any, floor: Any):
-    """Return the gains x, y, v of two overlapping slabs, a.z <= b.z (section 3.2.1, eq. 4)."""
-    one = type(beta)(1.0)
-    a0, a1, b0, b1, b2 = relative_lengths(a, b)
-    power_a = power(a, a0, floor)
-    power_b0 = power(b, b0, floor)
-    power_b1 = power(b, one - b2, floor)
-    x = beta * a1 + (one - beta) * optical_gain(a, a0, one, power_a, a.t)
-    y = beta * b1 + (one - beta) * optical_gain(b, b0, one - b2, power_b0, power_b1)
-    v = beta * b2 + (one - beta) * optical_gain(b, one - b2, one, power_b1, b.t)
-    return x, y, v
-
-
-@wp.func
-def boundary_adjoint(g: Any, s: Any, r: Any, power_r: Any, floor: Any):
-    """Return gradients in r and in the slab's a, t, l of <g, A(r)/A>, optical model; power_r is T^r."""
+@wp.func(inline=True)
+def optical_gain_adjoint(g: Any, a: Any, l: Any, r: Any, power: Any, floor: Any):  # noqa: E741
+    """Return gradients in A, log T and r of <g, (1 - T^r)/A>, the gain up to r; power is T^r."""
     zero = type(g)(0.0)
-    g_r = zero
-    g_a = zero
-    g_t = zero
-    g_l = zero
-    if r > zero:
-        if s.a < type(g)(SERIES_OPACITY):
-            series_a, series_r = series_gradient(s.a, r)
-            g_a = g * series_a
-            g_r = g * series_r
-        else:
-            g_power = -g / s.a
-            g_a = g_power * (type(g)(1.0) - power_r) / s.a
-            if r >= type(g)(1.0) and s.l < floor:
-                g_t = g_power
-            else:
-                g_r = g_power * power_r * wp.max(s.l, floor)
-                if s.l > floor:
-                    g_l = g_power * power_r * r
-    return g_r, g_a, g_t, g_l
+    if a < type(g)(SERIES_OPACITY):
+        by_a, by_r = series_gradient(a, r)
+        return g * by_a, zero, g * by_r
+    if l < floor and r >= type(g)(1.0):
+        return zero, zero, zero
+    g_power = -g / a
+    g_exponent = g_power * power
+    return g_power * (type(g)(1.0) - power) / a, wp.where(l > floor, g_exponent * r, zero), g_exponent * wp.max(l, floor)
 
 
-@wp.func
-def add_gains_gradient(s: Any, g: Any):
-    """Return the sum of two gradients, of which the second has no colour and weight."""
-    return slab(s.c, s.a + g.a, s.t + g.t, s.l + g.l, s.w, s.f + g.f, s.z + g.z)
-
-
-@wp.func
-def smooth_gains_adjoint(g_x: Any, g_y: Any, g_v: Any, a: Any, b: Any, beta: Any, floor: Any):
-    """Return gradients in a and b, of which colour and weight are 0, and in beta."""
-    one = type(beta)(1.0)
-    zero = type(beta)(0.0)
-    optical = one - beta
+@wp.func(inline=True)
+def optical_gains(a: Any, b: Any, front: Any, back: Any):
+    """Return the gains x, y, v of two overlapping slabs, a.z <= b.z, for beta = 0; front, back are `sfm_powers`."""
+    one = type(front)(1.0)
     a0, a1, b0, b1, b2 = relative_lengths(a, b)
-    power_a = power(a, a0, floor)
-    power_b0 = power(b, b0, floor)
-    power_b1 = power(b, one - b2, floor)
-    g_beta = (
-        g_x * (a1 - optical_gain(a, a0, one, power_a, a.t))
-        + g_y * (b1 - optical_gain(b, b0, one - b2, power_b0, power_b1))
-        + g_v * (b2 - optical_gain(b, one - b2, one, power_b1, b.t))
+    a_first = a.f < b.f
+    return (
+        optical_gain(a.a, a0, one, wp.where(a_first, front, one), a.t),
+        optical_gain(b.a, b0, one - b2, wp.where(a_first, one, front), back),
+        optical_gain(b.a, one - b2, one, back, b.t),
     )
-    # x = beta a1 + (1 - beta) (1 - gain up to a0), and so on: first the optical terms, then the lengths.
-    g_a0, g_aa, g_at, g_al = boundary_adjoint(-optical * g_x, a, a0, power_a, floor)
-    g_b0, g_ba, g_bt, g_bl = boundary_adjoint(-optical * g_y, b, b0, power_b0, floor)
-    g_r1, g_ba1, g_bt1, g_bl1 = boundary_adjoint(optical * (g_y - g_v), b, one - b2, power_b1, floor)
-    g_a1 = beta * g_x
-    g_b1 = beta * g_y
-    g_b2 = beta * g_v - g_r1
-    per_b = one / (b.z - b.f)
-    g_length_b = -(g_b0 * b0 + g_b1 * b1 + g_b2 * b2) * per_b
-    g_inner = (g_b0 - g_b1) * per_b
-    g_af = zero
-    g_az = (g_b1 - g_b2) * per_b
-    g_bf = -g_b0 * per_b - g_length_b
-    g_bz = g_b2 * per_b + g_length_b
-    if a.z > a.f:
-        per_a = one / (a.z - a.f)
-        g_length_a = -(g_a0 * a0 + g_a1 * a1) * per_a
-        g_inner += (g_a0 - g_a1) * per_a
-        g_af = -g_a0 * per_a - g_length_a
-        g_az += g_a1 * per_a + g_length_a
-    if a.f > b.f:
-        g_af += g_inner
-    else:
-        g_bf += g_inner
-    none = wp.vector(zero, zero, zero)
-    g_a = slab(none, g_aa, g_at, g_al, zero, g_af, g_az)
-    g_b = slab(none, g_ba + g_ba1, g_bt + g_bt1, g_bl + g_bl1, zero, g_bf, g_bz)
-    return g_a, g_b, g_beta
 
 
-@wp.func
+@wp.func(inline=True)
 def mix_weights(a: Any, b: Any, x: Any, y: Any, d_a: Any, d_1: Any, d_2: Any, mix: int):
     """Return the weights of the parts' colours in a mix, and whether opaque parts fixed them (then they add up to 1)."""
     zero = type(x)(0.0)
@@ -336,7 +278,7 @@ def mix_weights(a: Any, b: Any, x: Any, y: Any, d_a: Any, d_1: Any, d_2: Any, mi
     return a.w, b.w, False
 
 
-@wp.func
+@wp.func(inline=True)
 def merge(a: Any, b: Any, x: Any, y: Any, v: Any, mix: int):
     """Return the slab that a and b become, given their gains (section 3.2; mix: eq. 6-8, zSlab eq. 4.1-4.4)."""
     one = type(x)(1.0)
@@ -367,7 +309,7 @@ def merge(a: Any, b: Any, x: Any, y: Any, v: Any, mix: int):
     return slab(c, opacity, a.t * b.t, a.l + b.l, weight, wp.min(a.f, b.f), wp.max(a.z, b.z))
 
 
-@wp.func
+@wp.func(inline=True)
 def merge_adjoint(g: Any, a: Any, b: Any, x: Any, y: Any, v: Any, mix: int):
     """Return gradients in a, b, x, y and v. Every local g_n is the gradient in the n of `merge`."""
     one = type(x)(1.0)
@@ -465,3 +407,75 @@ def merge_adjoint(g: Any, a: Any, b: Any, x: Any, y: Any, v: Any, mix: int):
     g_a = slab(share_a * g.c, g_aa, g_at, g.l, g_aw, wp.where(a.f <= b.f, g.f, zero), wp.where(a.z > b.z, g.z, zero))
     g_b = slab(share_b * g.c, g_ba, g_bt, g.l, g_bw, wp.where(a.f <= b.f, zero, g.f), wp.where(a.z > b.z, zero, g.z))
     return g_a, g_b, g_x, g_y, g_v
+
+
+@wp.func(inline=True)
+def ofm(a: Any, b: Any, mix: int):
+    """Return the order-independent merging of two slabs (section 3.2.2): they are mixed whole."""
+    return merge(a, b, type(a.a)(1.0), type(a.a)(1.0), type(a.a)(0.0), mix)
+
+
+@wp.func(inline=True)
+def ofm_adjoint(g: Any, a: Any, b: Any, mix: int):
+    g_a, g_b, g_x, g_y, g_v = merge_adjoint(g, a, b, type(a.a)(1.0), type(a.a)(1.0), type(a.a)(0.0), mix)
+    return g_a, g_b
+
+
+@wp.func(inline=True)
+def sfm(a: Any, b: Any, beta: Any, mix: int, front: Any, back: Any):
+    """Return the smooth merging of two overlapping slabs, a.z <= b.z (section 3.2.1, eq. 4-5), given `sfm_powers`."""
+    a0, a1, b0, b1, b2 = relative_lengths(a, b)
+    x, y, v = optical_gains(a, b, front, back)
+    optical = type(beta)(1.0) - beta
+    return merge(a, b, beta * a1 + optical * x, beta * b1 + optical * y, beta * b2 + optical * v, mix)
+
+
+@wp.func(inline=True)
+def sfm_adjoint(g: Any, a: Any, b: Any, beta: Any, mix: int, floor: Any, front: Any, back: Any):
+    """Return the gradients in a, b and beta of `sfm`, in which the powers are no constants."""
+    one = type(beta)(1.0)
+    zero = type(beta)(0.0)
+    a0, a1, b0, b1, b2 = relative_lengths(a, b)
+    x, y, v = optical_gains(a, b, front, back)
+    optical = one - beta
+    g_a, g_b, g_x, g_y, g_v = merge_adjoint(
+        g, a, b, beta * a1 + optical * x, beta * b1 + optical * y, beta * b2 + optical * v, mix
+    )
+    g_beta = g_x * (a1 - x) + g_y * (b1 - y) + g_v * (b2 - v)
+    # The gains are differences of the gain up to a cut, which is constant at the ends of a slab.
+    a_first = a.f < b.f
+    g_front = -optical * wp.where(a_first, g_x, g_y)
+    g_back = optical * (g_y - g_v)
+    front_a, front_l, g_r0 = optical_gain_adjoint(
+        g_front, wp.where(a_first, a.a, b.a), wp.where(a_first, a.l, b.l), a0 + b0, front, floor
+    )
+    back_a, back_l, g_r1 = optical_gain_adjoint(g_back, b.a, b.l, one - b2, back, floor)
+    # Lengths: a0 and b0 reach from the first front to the inner one, a1 and b1 from there to a.z, b2 from a.z to b.z.
+    per_a = wp.where(a_first, one / (a.z - a.f), zero)
+    per_b = one / (b.z - b.f)
+    g_a1 = beta * g_x
+    g_b1 = beta * g_y
+    g_b2 = beta * g_v - g_r1
+    g_length_a = -(g_r0 * a0 + g_a1 * a1) * per_a
+    g_length_b = -(g_r0 * b0 + g_b1 * b1 + g_b2 * b2) * per_b
+    g_outer = -g_r0 * wp.where(a_first, per_a, per_b)
+    g_inner = -g_outer - g_a1 * per_a - g_b1 * per_b
+    more_a = slab(
+        g_a.c,
+        g_a.a + wp.where(a_first, front_a, zero),
+        g_a.t,
+        g_a.l + wp.where(a_first, front_l, zero),
+        g_a.w,
+        g_a.f + wp.where(a_first, g_outer, g_inner) - g_length_a,
+        g_a.z + g_a1 * per_a + g_length_a + (g_b1 - g_b2) * per_b,
+    )
+    more_b = slab(
+        g_b.c,
+        g_b.a + wp.where(a_first, zero, front_a) + back_a,
+        g_b.t,
+        g_b.l + wp.where(a_first, zero, front_l) + back_l,
+        g_b.w,
+        g_b.f + wp.where(a_first, g_inner, g_outer) - g_length_b,
+        g_b.z + g_b2 * per_b + g_length_b,
+    )
+    return more_a, more_b, g_beta

@@ -68,7 +68,7 @@ class Surfaces:
 
 def place_surfaces(geometry: Geometry, camera: Camera) -> Surfaces:
     """Take a scene's geometry from world to camera space, and its tables to the device of its arrays."""
-    device = wp.device_from_torch(geometry.vertices.device) if kind_of(geometry.vertices) == "torch" else "cpu"
+    device = wp.get_device(str(geometry.vertices.device)) if kind_of(geometry.vertices) == "torch" else "cpu"
     mapped = sorted(geometry.thickness_maps)
     maps = None
     if mapped:
@@ -136,9 +136,9 @@ def capture(
 ) -> Fragments:
     """Capture every surface that a pixel's ray meets as a fragment (the dynamic fragment buffer).
 
-    A triangle covers a pixel if the pixel's centre lies in its projection: by the top-left rule on edges, from both sides, between
-    the near and far planes. Differentiable in vertices, colour, opacity and thickness; which pixels a triangle covers, the
-    order of the fragments and the texels that a lookup takes are held fixed.
+    A triangle covers a pixel if the pixel's centre lies in its projection: by the top-left rule on edges, from both
+    sides, between the near and far planes. Differentiable in vertices, colour, opacity and thickness; which pixels a
+    triangle covers, the order of the fragments and the texels that a lookup takes are held fixed.
 
     Args:
         scene: what to capture.

@@ -1,9 +1,9 @@
 """The dynamic fragment buffer (Maule et al. 2012): count the fragments of each pixel, prefix sum, store, sort.
 
-Each pass is a function of its own. `rasterize` serves both the count and the store, so that they agree. On CUDA a thread takes
-a triangle and pixels are shared by atomic counters, then the sort makes the order deterministic. On the CPU a piece of work is
-a run of pixels, and goes through all triangles that may cover them: no two threads touch one pixel, and the fragments of a
-pixel come in the order of submission.
+Each pass is a function of its own. `rasterize` serves both the count and the store, so that they agree. On CUDA a
+thread takes a triangle and pixels are shared by atomic counters; then the sort makes the order deterministic. On the
+CPU a piece of work is a run of pixels, and goes through all triangles that may cover them: no two threads touch one
+pixel, and the fragments of a pixel come in the order of submission.
 """
 
 from dataclasses import dataclass
@@ -235,6 +235,7 @@ def store_fragments(triangles: Triangles, starts: wp.array, total: int, depths: 
 
 @wp.func
 def precedes(depth: Any, face: int, other_depth: Any, other_face: int):
+    """Tell whether a fragment comes before another, by depth, then triangle."""
     if depth != other_depth:
         return depth < other_depth
     return face < other_face

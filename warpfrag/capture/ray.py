@@ -1,14 +1,16 @@
 """Where the ray of a pixel meets a triangle: edge functions in homogeneous pixel coordinates (Olano and Greer 1997).
 
-Seen from the pixel centre (kx, ky), counted from the middle of the image, a corner (x, y, z) of a triangle in camera space
-lies at a = (s·x − kx·w, s·y − ky·w), where w = z and s is the focal length (perspective), or w = 1 and s pixels per scene
-unit (orthographic). The cross products of two corners are the triangle's edge functions, E = (b × c, c × a, a × b). The
-ray meets the triangle where all three have one sign, at the barycentric coordinates E / ΣE, which are exact in perspective:
-no corner is divided by its depth, so corners behind the eye need no clipping; the depth of the hit tells.
+Seen from the pixel centre (kx, ky), counted from the middle of the image, a corner (x, y, z) of a triangle in camera
+space lies at a = (s·x − kx·w, s·y − ky·w), where w = z and s is the focal length (perspective), or w = 1 and s pixels
+per scene unit (orthographic). The cross products of two corners are the triangle's edge functions,
+E = (b × c, c × a, a × b). The ray meets the triangle where all three have one sign, at the barycentric coordinates
+E / ΣE, which are exact in perspective: no corner is divided by its depth, so corners behind the eye need no clipping;
+the depth of the hit tells.
 
-A centre exactly on an edge (E = 0) counts as moved right by an infinitesimal ε and down by ε²: that is the top-left rule.
-All corners come ordered by their coordinates, so that two triangles compute the same |E| for the edge that they share, to the
-bit, whatever the compiler does with multiply-add; and as both see one corner at one place, so do the edges around a vertex.
+A centre exactly on an edge (E = 0) counts as moved right by an infinitesimal ε and down by ε²: that is the top-left
+rule. All corners come ordered by their coordinates, so that two triangles compute the same |E| for the edge that they
+share, to the bit, whatever the compiler does with multiply-add; and all edges that meet in a vertex see it at the same
+rounded place.
 """
 
 from dataclasses import dataclass
@@ -25,7 +27,7 @@ ONE = wp.constant(wp.float64(1.0))
 # Slack around projected corners [pixels]: coverage is decided by the edge functions, whose rounding is far below this.
 BOUND_MARGIN = wp.constant(wp.float64(1e-6))
 SPAN_MARGIN = wp.constant(wp.float64(1e-2))
-# An edge is followed from row to row only if it climbs by this much and stays this near: else rounding passes the margin.
+# An edge is followed from row to row only if it climbs this much and stays this near: else rounding passes the margin.
 SPAN_LEAST_CLIMB = wp.constant(wp.float64(1e-2))
 SPAN_FARTHEST = wp.constant(wp.float64(1e5))
 # Columns from which on it pays to look for the part of a row that a triangle crosses.
@@ -96,17 +98,19 @@ class Window:
 
 @wp.func
 def load_point(points: Any, vertex: int) -> wp.vec3d:
+    """Return a corner in camera space."""
     return wp.vec3d(wp.float64(points[vertex, 0]), wp.float64(points[vertex, 1]), wp.float64(points[vertex, 2]))
 
 
 @wp.func
 def centre_x(rays: Rays, column: int) -> wp.float64:
+    """Return how far right of the middle of the image a pixel centre lies [pixels]."""
     return wp.float64(column) + HALF - rays.middle_x
 
 
 @wp.func
 def centre_y(rays: Rays, row: int) -> wp.float64:
-    """Return the height of a pixel centre below the middle of the image; the row counts from the window's first."""
+    """Return how far below the middle of the image a pixel centre lies [pixels]; rows count from the window's first."""
     return wp.float64(rays.first_row + row) + HALF - rays.middle_y
 
 
@@ -120,6 +124,7 @@ def stretch(x: wp.float64, y: wp.float64, scale: wp.float64, perspective: int) -
 
 @wp.func
 def homogeneous(z: wp.float64, perspective: int) -> wp.float64:
+    """Return a corner's w."""
     return wp.where(perspective != 0, z, ONE)
 
 
@@ -132,6 +137,7 @@ def seen_from(corner: wp.vec3d, x: wp.float64, y: wp.float64, scale: wp.float64,
 
 @wp.func
 def cross(a: wp.vec2d, b: wp.vec2d) -> wp.float64:
+    """Return a × b."""
     return a[0] * b[1] - a[1] * b[0]
 
 
@@ -143,7 +149,7 @@ def edge_functions(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d) -> wp.vec3d:
 
 @wp.func
 def side(e: wp.float64, a: wp.vec2d, b: wp.vec2d, a_w: wp.float64, b_w: wp.float64) -> int:
-    """Return the sign of the edge function a × b, on the edge that of the centre moved by (ε, ε²); 0: no edge at all."""
+    """Return the sign of the edge function a × b; on the edge, as seen from the centre moved by (ε, ε²)."""
     if e > ZERO:
         return 1
     if e < ZERO:
@@ -246,6 +252,7 @@ def columns_of_row(rays: Rays, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, y: wp.floa
 
 @wp.func
 def extend_box(box: wp.vec4d, p: wp.vec2d) -> wp.vec4d:
+    """Extend a box (least x, largest x, least y, largest y) to a point."""
     return wp.vec4d(wp.min(box[0], p[0]), wp.max(box[1], p[0]), wp.min(box[2], p[1]), wp.max(box[3], p[1]))
 
 

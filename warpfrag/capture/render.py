@@ -32,8 +32,9 @@ def render(
 ) -> Any:
     """Render a scene: capture its fragments, merge them into layers, and composite those.
 
-    Differentiable in everything that `capture` and `resolve` are. An image that would take more memory than allowed is rendered in
-    bands of rows, with the same pixels to the bit; then its gradient is computed band by band, each captured once more.
+    Differentiable in everything that `capture` and `resolve` are. An image that would take more memory than allowed is
+    rendered in bands of rows, with the same pixels to the bit; then its gradient is computed band by band, each of them
+    captured once more.
 
     Args:
         scene: what to render.
@@ -48,8 +49,8 @@ def render(
         memory_limit: most memory that fragments and their gradients may take [bytes]; default half of what is free.
 
     Returns:
-        Premultiplied linear colour and opacity, (H, W, 4): a torch tensor if any parameter (or beta) is one, else a NumPy
-        array; float64 if any parameter (or beta) is an array of that, else float32.
+        Premultiplied linear colour and opacity, (H, W, 4): a torch tensor if any parameter (or beta) is one, else a
+        NumPy array; float64 if any parameter (or beta) is an array of that, else float32.
 
     Raises:
         TypeError: an argument is of the wrong type.
@@ -67,12 +68,12 @@ def render(
         parameters["beta"] = beta
     if kind_of(parameters.get("beta")) == "warp":
         raise TypeError("beta: got a wp.array, expected a number, a NumPy array or a torch.Tensor")
-    options = {
+    options: dict[str, Any] = {
         "max_layers": scene.layers if max_layers is None else max_layers,
         "merge": scene.merge if merge is None else merge,
         "mix": scene.mix if mix is None else mix,
     }
-    check_options(**options)
+    check_options(options["merge"], options["mix"], options["max_layers"])
     surfaces = place_surfaces(assemble(scene, parameters, camera=camera), camera)
     beta = _beta_like(parameters.get("beta", scene.beta), surfaces.rgba)
     beta_array(beta, surfaces.rgba, camera.shape)
@@ -100,7 +101,7 @@ def _render_window(
     del triangles
 
     def render_band(begin: int, end: int, *tensors: Any) -> Any:
-        """Render rows from the surfaces' points, colours, thickness, maps and beta, which torch's checkpoints pass on."""
+        """Render rows from points, colours, thickness, maps and beta: arguments, as torch's checkpoints want them."""
         *arrays, band_beta = tensors
         band_surfaces = replace(surfaces, **dict(zip(("points", "rgba", "thickness", "maps"), arrays, strict=True)))
         band_triangles = band_surfaces.triangles(replace(window, first_row=begin, row_count=end - begin))

@@ -5,9 +5,9 @@
     A = (sum l_i A_i) m_A;                  C = A (sum l_i c_i) m_c    (m: texel at sum l_i uv_i, bilinear; 1 without)
     t = sum l_i t_i, or the map's pixel;    times P(depth) where t is given in multiples of that
 
-Differentiable in the corners' positions, colour, opacity and thickness and in the thickness maps. Held fixed: which pixels a
-triangle covers, the order of the fragments, and which four texels a lookup takes (its place between them is not).
-Everything is computed in float64 and stored in the precision of the inputs.
+Differentiable in the corners' positions, colour, opacity and thickness and in the thickness maps. Held fixed: which
+pixels a triangle covers, the order of the fragments, and which four texels a lookup takes (its place between them is
+not). Everything is computed in float64 and stored in the precision of the inputs.
 """
 
 from collections.abc import Sequence
@@ -125,11 +125,8 @@ def _forward_kernel(scalar: Any) -> wp.Kernel:
                 if texture_id.shape[0] > 0:
                     texture = texture_id[face]
                     if texture >= 0:
-                        uv_i = load_uv(uv, i)
-                        uv_j = load_uv(uv, j)
-                        uv_k = load_uv(uv, k)
-                        at = look_up(texels, textures, texture, mix3(uv_i, uv_j, uv_k, hit[0], hit[1]))
-                        texel = texel_between(hit[0], hit[1], uv_i, uv_j, uv_k, at)
+                        place = mix3(load_uv(uv, i), load_uv(uv, j), load_uv(uv, k), hit[0], hit[1])
+                        texel = texel_between(place, look_up(texels, textures, texture, place))
                 shaded = premultiplied(
                     hit[0], hit[1], load_rgba(rgba, i), load_rgba(rgba, j), load_rgba(rgba, k), texel
                 )

@@ -1,12 +1,13 @@
 """The gradient of shading: from fragments to the corners of their triangles.
 
-Triangles are walked through once more, in strips of rows small enough that a large triangle does not keep one thread busy. A
-strip finds its fragments in the lists of the pixels that it covers and sums up their gradients, in row-major order, per corner;
-then every vertex sums the corners of its triangles, in the order of the triangles. No two threads write one address, and no sum
-depends on the number of threads.
+    C = A s, A = s_A, s = (sum l_i c_i) m:   dL/ds = (A dL/dC, dL/dA + <dL/dC, s>);  dL/dc_i = l_i m dL/ds
+    l = E / T, T = sum E:                    dL/dE_i = (dL/dl_i - sum l_j dL/dl_j) / T
+    E_a = b x c, ...:                        dL/da = dL/dE_c (b_y, -b_x) - dL/dE_b (c_y, -c_x)
 
-The gradient of a fragment is that of scalar functions, <cotangent, output>, which Warp differentiates: colour, texel, thickness,
-and the barycentric coordinates last.
+Triangles are walked through once more, in strips of rows small enough that a large triangle does not keep one thread
+busy. A strip finds its fragments in the lists of the pixels that it covers and sums up their gradients, in row-major
+order, per corner; then every vertex sums the corners of its triangles, in the order of the triangles. No two threads
+write one address, and no sum depends on the number of threads.
 """
 
 from collections.abc import Sequence
@@ -15,6 +16,7 @@ from typing import Any
 
 import warp as wp
 
+from warpfrag.capture.precision import DEPTH_STEP, depth_resolution_slope
 from warpfrag.capture.raster import prepare_triangles
 from warpfrag.capture.ray import (
     ONE,
@@ -24,9 +26,11 @@ from warpfrag.capture.ray import (
     centre_x,
     centre_y,
     columns_of_row,
+    edge_functions,
     hit_depth,
     is_wide,
     load_point,
+    seen_from,
     stretch,
 )
 from warpfrag.capture.shade import (
@@ -37,61 +41,103 @@ from warpfrag.capture.shade import (
     SHADE_OUTPUTS,
     SHADE_TENSORS,
     hit_weights,
-    premultiplied,
     present,
     shade_forward,
     shade_output_like,
     thickness_scale,
 )
 from warpfrag.capture.strips import cut_strips, first_at_least, gather_corners, rows_of_strip
-from warpfrag.capture.texture import Lookup, load_rgba, load_uv, look_up, mix3, texel_between
+from warpfrag.capture.texture import Lookup, load_rgba, load_uv, look_up, mix3, texel_between, texture_place
 from warpfrag.interop.launch import Span, launch
 from warpfrag.interop.operator import Operator
 
 wp.set_module_options({"enable_backward": False})
 
 
-@wp.func
-def color_pair(
-    g: wp.vec4d, l_b: wp.float64, l_c: wp.float64, a: wp.vec4d, b: wp.vec4d, c: wp.vec4d, texel: wp.vec4d
-) -> wp.float64:
-    return wp.dot(g, premultiplied(l_b, l_c, a, b, c, texel))
+@wp.struct
+class Corners:
+    """What the three corners of a triangle get of a gradient: positions, straight colour and opacity, thickness."""
+
+    point_a: wp.vec3d
+    point_b: wp.vec3d
+    point_c: wp.vec3d
+    rgba_a: wp.vec4d
+    rgba_b: wp.vec4d
+    rgba_c: wp.vec4d
+    thickness_a: wp.float64
+    thickness_b: wp.float64
+    thickness_c: wp.float64
+
+
+@wp.struct
+class Points:
+    """Gradients in the positions of the three corners of a triangle."""
+
+    a: wp.vec3d
+    b: wp.vec3d
+    c: wp.vec3d
 
 
 @wp.func
-def texel_pair(
-    g: wp.vec4d, l_b: wp.float64, l_c: wp.float64, a: wp.vec2d, b: wp.vec2d, c: wp.vec2d, at: Lookup
-) -> wp.float64:
-    """Return <g, texel>."""
-    return wp.dot(g, texel_between(l_b, l_c, a, b, c, at))
+def texel_adjoint(g: wp.vec4d, u: wp.vec2d, at: Lookup) -> wp.vec2d:
+    """Return the gradient in the texture coordinates of <g, texel>; u is where the texture is read."""
+    place = texture_place(u, at.size)
+    x = place[0] - at.before[0]
+    y = place[1] - at.before[1]
+    upper = at.upper_right - at.upper_left
+    lower = at.lower_right - at.lower_left
+    down = at.lower_left + x * lower - at.upper_left - x * upper
+    return wp.vec2d(wp.dot(g, upper + y * (lower - upper)) * at.size[0], -wp.dot(g, down) * at.size[1])
 
 
 @wp.func
-def thickness_pair(
-    g: wp.float64, own: wp.float64, depth: wp.float64, in_p: int, near: wp.float64, far: wp.float64
-) -> wp.float64:
-    return g * own * thickness_scale(depth, in_p, near, far)
+def turned(g: wp.float64, p: wp.vec2d) -> wp.vec2d:
+    """Return the gradient in a of g a × p; in a of g p × a it is the negative."""
+    return wp.vec2d(g * p[1], -g * p[0])
 
 
 @wp.func
-def mix_pair(
-    g: wp.float64, a: wp.float64, b: wp.float64, c: wp.float64, l_b: wp.float64, l_c: wp.float64
-) -> wp.float64:
-    return g * mix3(a, b, c, l_b, l_c)
+def lifted(g: wp.vec2d, g_z: wp.float64, x: wp.float64, y: wp.float64, scale: wp.float64, perspective: int) -> wp.vec3d:
+    """Return the gradient in a corner, given that in its place seen from the pixel and that in its depth."""
+    if perspective != 0:
+        g_z -= x * g[0] + y * g[1]
+    return wp.vec3d(scale * g[0], scale * g[1], g_z)
 
 
 @wp.func
-def hit_pair(
-    g: wp.vec3d,
+def hit_adjoint(
+    g_b: wp.float64,
+    g_c: wp.float64,
+    g_z: wp.float64,
     a: wp.vec3d,
     b: wp.vec3d,
     c: wp.vec3d,
+    rays: Rays,
     x: wp.float64,
     y: wp.float64,
-    scale: wp.float64,
-    perspective: int,
-) -> wp.float64:
-    return wp.dot(g, hit_weights(a, b, c, x, y, scale, perspective))
+) -> Points:
+    """Return the gradient in the corners' positions of <g, (l_b, l_c, z)>, what `hit_weights` returns."""
+    seen_a = seen_from(a, x, y, rays.scale, rays.perspective)
+    seen_b = seen_from(b, x, y, rays.scale, rays.perspective)
+    seen_c = seen_from(c, x, y, rays.scale, rays.perspective)
+    e = edge_functions(seen_a, seen_b, seen_c)
+    total = e[0] + e[1] + e[2]
+    l_b = e[1] / total
+    l_c = e[2] / total
+    g_b += g_z * (b[2] - a[2])
+    g_c += g_z * (c[2] - a[2])
+    mean = g_b * l_b + g_c * l_c
+    e_a = -mean / total
+    e_b = (g_b - mean) / total
+    e_c = (g_c - mean) / total
+    to_a = turned(e_c, seen_b) - turned(e_b, seen_c)
+    to_b = turned(e_a, seen_c) - turned(e_c, seen_a)
+    to_c = turned(e_b, seen_a) - turned(e_a, seen_b)
+    to = Points()
+    to.a = lifted(to_a, g_z * (ONE - l_b - l_c), x, y, rays.scale, rays.perspective)
+    to.b = lifted(to_b, g_z * l_b, x, y, rays.scale, rays.perspective)
+    to.c = lifted(to_c, g_z * l_c, x, y, rays.scale, rays.perspective)
+    return to
 
 
 @wp.func
@@ -164,15 +210,7 @@ def _strip_kernel(scalar: Any) -> wp.Kernel:
                 uv_a = load_uv(uv, i)
                 uv_b = load_uv(uv, j)
                 uv_c = load_uv(uv, k)
-            sum_a = wp.vec3d()
-            sum_b = wp.vec3d()
-            sum_c = wp.vec3d()
-            sum_rgba_a = wp.vec4d()
-            sum_rgba_b = wp.vec4d()
-            sum_rgba_c = wp.vec4d()
-            sum_own_a = wp.float64(0.0)
-            sum_own_b = wp.float64(0.0)
-            sum_own_c = wp.float64(0.0)
+            sum = Corners()
             wide = is_wide(rays, a, b, c, left, right)
             for row in range(top, wp.min(top + strip_rows, boxes[face, 1])):
                 y = centre_y(rays, row)
@@ -196,64 +234,62 @@ def _strip_kernel(scalar: Any) -> wp.Kernel:
                         if grad_fragment_depth.shape[0] > 0:
                             grad_depth = wp.float64(grad_fragment_depth[fragment])
                         if grad_fragment_rgba.shape[0] > 0:
+                            # C = A s, A = s_A, s = straight colour and opacity times texel.
                             g = load_rgba(grad_fragment_rgba, fragment)
+                            straight = mix3(rgba_a, rgba_b, rgba_c, l_b, l_c)
                             texel = wp.vec4d(ONE, ONE, ONE, ONE)
-                            at = look_up(texels, textures, texture, mix3(uv_a, uv_b, uv_c, l_b, l_c))
+                            at = Lookup()
+                            place = mix3(uv_a, uv_b, uv_c, l_b, l_c)
                             if texture >= 0:
-                                texel = texel_between(l_b, l_c, uv_a, uv_b, uv_c, at)
-                            # What is not needed goes to a name of its type: _4 is a vec4d, and so on.
-                            _4, color_b, color_c, to_a, to_b, to_c, to_texel = wp.grad(color_pair)(
-                                g, l_b, l_c, rgba_a, rgba_b, rgba_c, texel
+                                at = look_up(texels, textures, texture, place)
+                                texel = texel_between(place, at)
+                            s = wp.cw_mul(straight, texel)
+                            g = wp.vec4d(
+                                g[0] * s[3], g[1] * s[3], g[2] * s[3], g[3] + g[0] * s[0] + g[1] * s[1] + g[2] * s[2]
                             )
-                            sum_rgba_a += to_a
-                            sum_rgba_b += to_b
-                            sum_rgba_c += to_c
-                            grad_b += color_b
-                            grad_c += color_c
+                            to_straight = wp.cw_mul(g, texel)
+                            sum.rgba_a += (ONE - l_b - l_c) * to_straight
+                            sum.rgba_b += l_b * to_straight
+                            sum.rgba_c += l_c * to_straight
+                            grad_b += wp.dot(to_straight, rgba_b - rgba_a)
+                            grad_c += wp.dot(to_straight, rgba_c - rgba_a)
                             if texture >= 0:
-                                _4, texel_b, texel_c, _2, _2, _2, _at = wp.grad(texel_pair)(
-                                    to_texel, l_b, l_c, uv_a, uv_b, uv_c, at
-                                )
-                                grad_b += texel_b
-                                grad_c += texel_c
+                                to_place = texel_adjoint(wp.cw_mul(g, straight), place, at)
+                                grad_b += wp.dot(to_place, uv_b - uv_a)
+                                grad_c += wp.dot(to_place, uv_c - uv_a)
                         if grad_fragment_thickness.shape[0] > 0:
-                            own = mix3(own_a, own_b, own_c, l_b, l_c)
-                            if map >= 0:
-                                own = wp.float64(maps[map, rays.first_row * rays.width + pixel])
-                            _1, to_own, own_depth, _i, _1, _1 = wp.grad(thickness_pair)(
-                                wp.float64(grad_fragment_thickness[fragment]),
-                                own, hit[2] * along, in_p, rays.near, rays.far,
-                            )  # fmt: skip
-                            grad_depth += own_depth
+                            to_own = wp.float64(grad_fragment_thickness[fragment])
+                            if in_p != 0:
+                                own = mix3(own_a, own_b, own_c, l_b, l_c)
+                                if map >= 0:
+                                    own = wp.float64(maps[map, rays.first_row * rays.width + pixel])
+                                depth = hit[2] * along
+                                slope = depth_resolution_slope(depth, rays.near, rays.far, DEPTH_STEP)
+                                grad_depth += to_own * own * slope
+                                to_own *= thickness_scale(depth, in_p, rays.near, rays.far)
                             if map < 0:
-                                _1, own_to_a, own_to_b, own_to_c, own_l_b, own_l_c = wp.grad(mix_pair)(
-                                    to_own, own_a, own_b, own_c, l_b, l_c
-                                )
-                                sum_own_a += own_to_a
-                                sum_own_b += own_to_b
-                                sum_own_c += own_to_c
-                                grad_b += own_l_b
-                                grad_c += own_l_c
+                                sum.thickness_a += (ONE - l_b - l_c) * to_own
+                                sum.thickness_b += l_b * to_own
+                                sum.thickness_c += l_c * to_own
+                                grad_b += to_own * (own_b - own_a)
+                                grad_c += to_own * (own_c - own_a)
                         if grad_points.shape[0] > 0:
-                            _3, hit_a, hit_b, hit_c, _1, _1, _1, _i = wp.grad(hit_pair)(
-                                wp.vec3d(grad_b, grad_c, grad_depth * along),
-                                a, b, c, x, y, rays.scale, rays.perspective,
-                            )  # fmt: skip
-                            sum_a += hit_a
-                            sum_b += hit_b
-                            sum_c += hit_c
+                            to = hit_adjoint(grad_b, grad_c, grad_depth * along, a, b, c, rays, x, y)
+                            sum.point_a += to.a
+                            sum.point_b += to.b
+                            sum.point_c += to.c
             if grad_points.shape[0] > 0:
-                grad_points[strip, 0] = sum_a
-                grad_points[strip, 1] = sum_b
-                grad_points[strip, 2] = sum_c
+                grad_points[strip, 0] = sum.point_a
+                grad_points[strip, 1] = sum.point_b
+                grad_points[strip, 2] = sum.point_c
             if grad_rgba.shape[0] > 0:
-                grad_rgba[strip, 0] = sum_rgba_a
-                grad_rgba[strip, 1] = sum_rgba_b
-                grad_rgba[strip, 2] = sum_rgba_c
+                grad_rgba[strip, 0] = sum.rgba_a
+                grad_rgba[strip, 1] = sum.rgba_b
+                grad_rgba[strip, 2] = sum.rgba_c
             if grad_thickness.shape[0] > 0:
-                grad_thickness[strip, 0] = sum_own_a
-                grad_thickness[strip, 1] = sum_own_b
-                grad_thickness[strip, 2] = sum_own_c
+                grad_thickness[strip, 0] = sum.thickness_a
+                grad_thickness[strip, 1] = sum.thickness_b
+                grad_thickness[strip, 2] = sum.thickness_c
 
     return shade_bwd
 

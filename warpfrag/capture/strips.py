@@ -18,11 +18,13 @@ STRIP_PIXELS = wp.constant(1024)
 
 @wp.func
 def rows_of_strip(left: int, right: int) -> int:
+    """Return how many rows a strip of a triangle has, given the columns of its box."""
     return wp.max(1, STRIP_PIXELS // wp.max(1, right - left))
 
 
 @wp.kernel(module="unique", enable_backward=False)
 def count_strips(span: Span, boxes: wp.array2d[int], counts: wp.array[int]):
+    """Count the strips of each triangle."""
     for face in range(span.begin + wp.tid(), span.end, span.stride):
         rows = rows_of_strip(boxes[face, 2], boxes[face, 3])
         counts[face] = (boxes[face, 1] - boxes[face, 0] + rows - 1) // rows
@@ -96,7 +98,7 @@ def gather_corners(
     Args:
         corners: vertex of each corner, (N, 3) int32.
         strip_ends: where each triangle's strips end, (N,) int32.
-        sums: for each strip and corner the gradient of its point, colour and thickness; those without a target are empty.
+        sums: by strip and corner the gradient of its point, colour and thickness; those without a target are empty.
         targets: the gradients by vertex to fill, (V, 3), (V, 4) and (V,), or None.
         scalar: Warp type of the targets.
     """

@@ -1,6 +1,8 @@
-"""The progress bar of a fit on the terminal."""
+"""The progress of a fit on the terminal."""
 
-from collections.abc import Iterator
+import sys
+import time
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -9,11 +11,13 @@ from warpfrag.fit.session import Progress
 
 # More parameters than this do not fit on a line.
 _MOST_SHOWN = 5
+# Where standard error is no terminal, such as a log file: a line so often.
+_SECONDS_PER_LINE = 10.0
 
 
 @contextmanager
 def progress_bar(name: str) -> Iterator[Any]:
-    """Show a bar with step, loss and parameters on standard error while the block runs.
+    """Show step, loss and parameters on standard error while the block runs: a bar, or now and then a line.
 
     Args:
         name: what is being fitted.
@@ -21,26 +25,52 @@ def progress_bar(name: str) -> Iterator[Any]:
     Yields:
         The function to call with each `Progress`.
     """
-    from rich.console import Console
+    from rich.console import Console, RenderableType
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
+    from rich.text import Text
 
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(bar_width=20),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("{task.fields[words]}", markup=False),
-    )
+    class TwoLines(Bar):
+        """The bar, and below it loss and parameters on a line of their own."""
+
+        def get_renderables(self) -> Iterable[RenderableType]:
+            yield self.make_tasks_table(self.tasks)
+            for task in self.tasks:
+                yield Text(task.fields["words"], overflow="ellipsis", no_wrap=True)
+
     console = Console(stderr=True)
-    with Bar(*columns, console=console) as bar:
+    if not console.is_terminal:
+        yield _lines(name)
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with TwoLines(*columns, console=console) as bar:
         task = bar.add_task(name, total=None, words="preparing")
 
         def show(progress: Progress) -> None:
-            words = progress.message
-            if not words:
-                shown = dict(list(progress.parameters.items())[:_MOST_SHOWN])
-                words = f"loss {progress.loss:.3g}, {values_words(shown)}"
-            bar.update(task, completed=progress.step, total=progress.steps or None, words=words)
+            bar.update(task, completed=progress.step, total=progress.steps or None, words=_words(progress))
 
-        yield show
+        try:
+            yield show
+        except Exception:
+            # The line that tells what went wrong is to stand alone.
+            bar.live.transient = True
+            raise
+
+
+def _lines(name: str) -> Any:
+    told = time.monotonic()
+
+    def show(progress: Progress) -> None:
+        nonlocal told
+        if time.monotonic() - told >= _SECONDS_PER_LINE:
+            told = time.monotonic()
+            print(f"{name}: step {progress.step}/{progress.steps}, {_words(progress)}", file=sys.stderr, flush=True)
+
+    return show
+
+
+def _words(progress: Progress) -> str:
+    if progress.message:
+        return progress.message
+    shown = dict(list(progress.parameters.items())[:_MOST_SHOWN])
+    return f"loss {progress.loss:.3g}, {values_words(shown)}"

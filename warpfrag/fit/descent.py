@@ -12,11 +12,13 @@ from typing import Any
 
 import numpy as np
 
+from warpfrag.extras import need
 from warpfrag.fit.jacobian import Evaluation
 from warpfrag.fit.losses import RobustLoss
 from warpfrag.fit.outcome import Outcome
 from warpfrag.fit.problem import Problem
 from warpfrag.fit.session import FitError, Session, check_finite
+from warpfrag.fit.study import StudyError
 
 # Adam stops when the best loss of so many steps is not better than the best before them by the tolerance.
 ADAM_PATIENCE = 50
@@ -31,7 +33,8 @@ class _Coordinate:
     """One parameter's coordinates as a torch leaf, in the way a method moves them."""
 
     def __init__(self, problem: Problem, index: int, bent: bool) -> None:
-        torch = problem.torch
+        import torch
+
         self.variable = variable = problem.study.variables[index]
         self.lower, self.upper = variable.span
         self.bent = bent and math.isfinite(self.lower)
@@ -40,7 +43,7 @@ class _Coordinate:
             self.middle, self.half = 0.5 * (self.lower + self.upper), 0.5 * (self.upper - self.lower)
             share = np.clip((start - self.middle) / self.half, INSIDE - 1.0, 1.0 - INSIDE)
             start = self.half * np.arcsin(share)
-        self.leaf = torch.tensor(start, dtype=torch.float64, device=problem.device, requires_grad=True)
+        self.leaf = torch.tensor(start, dtype=torch.float64, device=problem.study.device, requires_grad=True)
 
     def coordinate(self) -> Any:
         """Return the coordinate, differentiable."""
@@ -57,7 +60,15 @@ class _Descent:
 
     def __init__(self, problem: Problem, session: Session, bent: bool) -> None:
         study = problem.study
-        self.problem, self.session = problem, session
+        torch = need("torch", "torch", "Adam and L-BFGS")
+        try:
+            torch.zeros(1, device=study.device)
+        except (RuntimeError, AssertionError) as error:
+            reason = str(error).splitlines()[0]
+            raise StudyError(f"device: found {study.device!r}, which torch cannot use ({reason})") from None
+        torch.manual_seed(study.seed)
+        self.torch, self.problem, self.session = torch, problem, session
+        self.frozen = problem.frozen.torch(study.device) if problem.frozen is not None else None
         self.loss = RobustLoss.named(study.loss, study.delta)
         self.coordinates = [_Coordinate(problem, index, bent) for index in range(len(study.variables))]
         self.evaluations = 0
@@ -76,7 +87,7 @@ class _Descent:
         tensors = {c.variable.name: c.variable.outward(c.coordinate()) for c in self.coordinates}
         values = {name: tensor.detach().cpu().numpy() for name, tensor in tensors.items()}
         try:
-            image = self.problem.image(tensors)
+            image = self.problem.image(tensors, self.frozen)
         except ValueError as error:
             check_finite(step, math.nan, values)
             raise FitError(f"step {step}: {error}") from error
@@ -87,7 +98,7 @@ class _Descent:
         # An image that does not depend on a parameter (all of it behind an opaque one, say) has no gradient for it.
         for coordinate in self.coordinates:
             if coordinate.leaf.grad is None:
-                coordinate.leaf.grad = self.problem.torch.zeros_like(coordinate.leaf)
+                coordinate.leaf.grad = self.torch.zeros_like(coordinate.leaf)
         check_finite(step, number, values, {c.variable.name: c.leaf.grad.cpu().numpy() for c in self.coordinates})
         self.evaluations += 1
         if number < self.best_loss:
@@ -110,7 +121,7 @@ class _Descent:
             "losses": list(self.session.losses),
             "evaluations": self.evaluations,
             "best_loss": self.best_loss,
-            "best": self.problem.torch.tensor(self.best),
+            "best": self.torch.tensor(self.best),
         }
 
     def restore(self, optimizer: Any) -> None:
@@ -139,7 +150,7 @@ def adam(problem: Problem, session: Session) -> Outcome:
     study = problem.study
     descent = _Descent(problem, session, bent=False)
     groups = [{"params": [c.leaf], "lr": c.variable.learning_rate or study.learning_rate} for c in descent.coordinates]
-    optimizer = problem.torch.optim.Adam(groups)
+    optimizer = descent.torch.optim.Adam(groups)
     descent.restore(optimizer)
     losses = session.losses
     while len(losses) < int(study.steps or 0):
@@ -158,7 +169,7 @@ def lbfgs(problem: Problem, session: Session) -> Outcome:
     """Fit by L-BFGS with a strong Wolfe line search."""
     study = problem.study
     descent = _Descent(problem, session, bent=True)
-    optimizer = problem.torch.optim.LBFGS(
+    optimizer = descent.torch.optim.LBFGS(
         [c.leaf for c in descent.coordinates],
         lr=1.0,
         max_iter=1,

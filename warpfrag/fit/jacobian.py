@@ -9,13 +9,14 @@ bytes.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+import warp as wp
 
 from warpfrag.fit.losses import RobustLoss
 from warpfrag.fit.parameters import Variable
-from warpfrag.fit.problem import FrozenGeometry, Problem
+from warpfrag.fit.problem import Problem
+from warpfrag.fragments import Fragments
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,91 +40,89 @@ class Evaluation:
 
     def __init__(self, problem: Problem, loss: RobustLoss, coordinates: np.ndarray) -> None:
         assert problem.frozen is not None
-        self.problem, self.loss, self.frozen = problem, loss, problem.frozen
+        self.problem, self.loss, self.unit = problem, loss, problem.frozen
         self.values = problem.values(coordinates)
-        keys = {variable.key for variable in problem.study.variables}
-        self.tensors = problem.tensors(self.values)
-        self.rgba, self.thickness = self.frozen.arrays(self.tensors)
-        beta: Any = float(problem.scene.beta)
-        if "beta" in keys:
-            # One value per pixel, so that its gradient stays apart by pixel.
-            beta = self.tensors["beta"].expand(problem.scene.camera.shape).contiguous()
-        wanted = (
-            ("beta" in keys, beta),
-            ("thickness" in keys, self.thickness),
-            (bool(keys & {"opacity", "color"}), self.rgba),
+        self.variables = problem.study.variables
+        keys = {variable.key for variable in self.variables}
+        single = {name: value.astype(np.float32) for name, value in self.values.items()}
+        fragments = self.unit.scaled(single)
+        device = problem.study.device
+        # Beta as one value per pixel, so that its gradient stays apart by pixel.
+        beta = np.full(problem.scene.camera.shape, single.get("beta", problem.scene.beta), np.float32)
+        self.rgba = wp.array(fragments.rgba, device=device, requires_grad=bool(keys & {"opacity", "color"}))
+        self.thickness = wp.array(fragments.thickness, device=device, requires_grad="thickness" in keys)
+        self.beta = wp.array(beta, device=device, requires_grad="beta" in keys)
+        shared = Fragments(
+            self.rgba,
+            wp.array(fragments.depth, device=device),
+            self.thickness,
+            wp.array(fragments.offsets, device=device),
+            fragments.shape,
         )
-        self.leaves = [leaf.detach().requires_grad_(True) if need else leaf for need, leaf in wanted]
-        beta, self.thickness, self.rgba = self.leaves
-        fragments = self.frozen.with_arrays(self.rgba, self.thickness)
-        self.raw = problem.composite(fragments, beta)
-        image = problem.over_background(self.raw.detach())
-        self.residual = problem.residual(image).cpu().numpy().astype(np.float64).reshape(-1, problem.channels)
+        self.tape = wp.Tape()
+        with self.tape:
+            self.raw = problem.composite(shared, self.beta)
+        image = problem.over_background(self.raw.numpy())
+        self.residual = problem.residual(image).astype(np.float64).reshape(-1, problem.channels)
         self.cost = float(loss.rho(self.residual).mean())
 
     def compress(self) -> Compressed:
         """Return the compressed residuals and Jacobian."""
-        covered, count = self.frozen.covered, self.residual.size
-        columns = sum(variable.start.size for variable in self.problem.study.variables)
+        # Pixels that no fragment covers do not depend on anything.
+        counts = np.diff(self.unit.fragments.offsets)
+        covered = np.flatnonzero(counts)
+        pixels = np.repeat(np.arange(counts.size), counts)
+        columns = sum(variable.start.size for variable in self.variables)
         triangle = np.zeros((columns + 1, columns + 1))
         for channel in range(self.problem.channels):
-            jacobian = self._channel(channel)[covered]
+            jacobian = self.channel(channel, pixels)[covered]
             residual = self.residual[covered, channel]
             weight = np.sqrt(self.loss.weight(residual))
             rows = np.concatenate([residual[:, None], jacobian], axis=1) * weight[:, None]
             triangle = np.asarray(np.linalg.qr(np.concatenate([triangle, rows]), mode="r"))
-        return _compress(triangle / np.sqrt(count), self.cost)
+        return _compress(triangle / np.sqrt(self.residual.size), self.cost)
 
-    def _channel(self, channel: int) -> np.ndarray:
-        """Return the derivatives of one channel of the image in all coordinates, (pixels, P)."""
-        torch, background = self.problem.torch, self.problem.background
-        variables = self.problem.study.variables
-        pixels = self.residual.shape[0]
+    def channel(self, channel: int, pixels: np.ndarray) -> np.ndarray:
+        """Return the derivatives of one channel of the image in all coordinates, (P, coordinates).
+
+        Args:
+            channel: 0 to 3.
+            pixels: the pixel of each fragment.
+        """
+        background = self.problem.background
         # Opacity does not depend on beta, thickness or colour: no pass where it cannot change.
-        fixed = channel == 3 and (background[3] == 1.0 or all(variable.key != "opacity" for variable in variables))
-        if fixed:
-            return np.zeros((pixels, sum(variable.start.size for variable in variables)))
-        seed = torch.zeros_like(self.raw)
+        if channel == 3 and (background[3] == 1.0 or all(variable.key != "opacity" for variable in self.variables)):
+            return np.zeros((len(self.residual), sum(variable.start.size for variable in self.variables)))
+        seed = np.zeros(self.raw.shape, np.float32)
         seed[..., channel] = 1.0
-        seed[..., 3] -= float(background[channel])
-        needed = [leaf for leaf in self.leaves if isinstance(leaf, torch.Tensor) and leaf.requires_grad]
-        grads = iter(torch.autograd.grad(self.raw, needed, seed, retain_graph=True))
-        grad_beta, grad_thickness, grad_rgba = (  # type: ignore[var-annotated]
-            next(grads).cpu().numpy() if isinstance(leaf, torch.Tensor) and leaf.requires_grad else None
-            for leaf in self.leaves
-        )
+        seed[..., 3] -= background[channel]
+        self.tape.zero()
+        self.tape.backward(grads={self.raw: wp.array(seed, device=self.raw.device)})
         columns = [
-            grad_beta.astype(np.float64).reshape(-1, 1)
+            self.beta.grad.numpy().astype(np.float64).reshape(-1, 1)
             if variable.key == "beta"
-            else self._object(variable, grad_thickness, grad_rgba)
-            for variable in variables
+            else self._object(variable, pixels)
+            for variable in self.variables
         ]
         return np.concatenate(columns, axis=1)
 
-    def _object(self, variable: Variable, grad_thickness: Any, grad_rgba: Any) -> np.ndarray:
-        """Sum what the fragments of an object contribute, by pixel: (pixels, 1), or (pixels, 3) for a colour."""
-        owner, frozen = variable.owner, self.frozen
-        members = frozen.members[owner]
-        unit = _numpy(frozen.fragments.rgba)[members]
-        value = self.values[variable.name]
+    def _object(self, variable: Variable, pixels: np.ndarray) -> np.ndarray:
+        """Sum what the fragments of an object contribute, by pixel: (P, 1), or (P, 3) for a colour."""
+        owner, value = variable.owner, self.values[variable.name]
+        members = np.flatnonzero(self.unit.masks[owner])
         if variable.key == "thickness":
             # Coordinates are logarithms: dt/dlog = t.
-            each = (grad_thickness[members] * _numpy(frozen.fragments.thickness)[members] * value)[:, None]
-        elif variable.key == "opacity":
-            color = np.asarray(self.values.get(f"{owner}.color", np.ones(3)))
-            each = np.sum(grad_rgba[members] * unit * np.append(color, 1.0), axis=1, keepdims=True)
+            unit = self.unit.fragments.thickness[members]
+            each = (self.thickness.grad.numpy()[members] * unit * value)[:, None]
         else:
-            each = grad_rgba[members, :3] * unit[:, :3] * float(self.values.get(f"{owner}.opacity", 1.0))
-        return _sum_by_pixel(each, frozen, owner, self.residual.shape[0])
-
-
-def _sum_by_pixel(each: np.ndarray, frozen: FrozenGeometry, owner: str, pixels: int) -> np.ndarray:
-    columns = each.astype(np.float64).T
-    return np.stack([np.bincount(frozen.member_pixels[owner], column, pixels) for column in columns], axis=1)
-
-
-def _numpy(tensor: Any) -> np.ndarray:
-    return tensor.detach().cpu().numpy()
+            unit, grad = self.unit.fragments.rgba[members], self.rgba.grad.numpy()[members]
+            if variable.key == "opacity":
+                color = self.values.get(f"{owner}.color", np.ones(3))
+                each = np.sum(grad * unit * np.append(color, 1.0), axis=1, keepdims=True)
+            else:
+                each = grad[:, :3] * unit[:, :3] * float(self.values.get(f"{owner}.opacity", 1.0))
+        sums = [np.bincount(pixels[members], column, len(self.residual)) for column in each.astype(np.float64).T]
+        return np.stack(sums, axis=1)
 
 
 def _compress(triangle: np.ndarray, cost: float) -> Compressed:

@@ -37,26 +37,24 @@ class _Memory:
         self.kept: tuple[bytes, Evaluation] | None = None
         state = session.state
         if state:
-            keys = [np.asarray(x).tobytes() for x in state["coordinates"].cpu().numpy()]
+            keys = [x.tobytes() for x in state["coordinates"]]
             self.costs = dict(zip(keys, state["costs"].tolist(), strict=True))
             self.jacobians = {
-                keys[i]: j for i, j in zip(state["jacobian_of"].tolist(), state["jacobians"].cpu().numpy(), strict=True)
+                keys[i]: j for i, j in zip(state["jacobian_of"].tolist(), state["jacobians"], strict=True)
             }
         self.recorded = set(self.costs)
 
     def state(self) -> dict[str, Any]:
-        """Return everything as tensors."""
-        import torch
-
+        """Return everything as arrays."""
         keys = list(self.costs)
         count = len(np.frombuffer(keys[0])) if keys else 0
         order = {key: index for index, key in enumerate(keys)}
         jacobians = np.stack(list(self.jacobians.values())) if self.jacobians else np.zeros((0, count + 2, count))
         return {
-            "coordinates": torch.tensor(np.stack([np.frombuffer(key) for key in keys])),
-            "costs": torch.tensor(list(self.costs.values()), dtype=torch.float64),
-            "jacobian_of": torch.tensor([order[key] for key in self.jacobians], dtype=torch.int64),
-            "jacobians": torch.tensor(jacobians),
+            "coordinates": np.stack([np.frombuffer(key) for key in keys]),
+            "costs": np.array(list(self.costs.values())),
+            "jacobian_of": np.array([order[key] for key in self.jacobians], dtype=np.int64),
+            "jacobians": jacobians,
         }
 
     def evaluate(self, coordinates: np.ndarray) -> Evaluation:

@@ -94,7 +94,7 @@ class Variable:
 
     def outward(self, coordinate: Any) -> Any:
         """Return the value of a coordinate, an array or a tensor."""
-        if isinstance(coordinate, np.ndarray):
+        if isinstance(coordinate, (np.ndarray, np.generic)):
             return np.clip(np.exp(coordinate), self.lower, self.upper) if self.logarithm else coordinate * self.unit
         # Rounding must not carry a bound across itself.
         return coordinate.exp().clamp(self.lower, self.upper) if self.logarithm else coordinate * self.unit

@@ -14,10 +14,10 @@ import numpy as np
 from warpfrag.capture.capture import capture
 from warpfrag.capture.render import render
 from warpfrag.composite import composite
-from warpfrag.extras import need
 from warpfrag.fit.parameters import Variable
 from warpfrag.fit.study import Study, StudyError
 from warpfrag.fragments import Fragments
+from warpfrag.interop.operator import kind_of
 from warpfrag.scene.objects import Scene
 
 
@@ -26,49 +26,42 @@ class FrozenGeometry:
 
     Args:
         scene: the scene.
-        variables: what will be given to `arrays`, all global.
-        device: where the tensors are to be.
+        variables: what will be given to `scaled`, all global.
     """
 
-    def __init__(self, scene: Scene, variables: Sequence[Variable], device: str) -> None:
-        torch = need("torch", "torch", "Fitting")
+    def __init__(self, scene: Scene, variables: Sequence[Variable]) -> None:
         ones = {v.name: np.ones(v.start.shape, np.float32) for v in variables if v.key != "beta"}
-        captured = capture(scene, parameters=ones)
-        self.fragments = captured.torch(device)
-        self.objects = {
-            v.owner: index for v in variables for index, item in enumerate(scene.objects) if item.name == v.owner
+        self.fragments: Fragments = capture(scene, parameters=ones).numpy()
+        owners = {variable.owner for variable in variables}
+        self.masks: dict[str, Any] = {
+            item.name: self.fragments.object_id == index
+            for index, item in enumerate(scene.objects)
+            if item.name in owners
         }
-        self.masks = {name: self.fragments.object_id == index for name, index in self.objects.items()}
-        counts = np.diff(captured.numpy().offsets)
-        self.covered = np.flatnonzero(counts)
-        pixels = np.repeat(np.arange(counts.size), counts)
-        self.members = {name: torch.nonzero(mask).reshape(-1).cpu().numpy() for name, mask in self.masks.items()}
-        self.member_pixels = {name: pixels[members] for name, members in self.members.items()}
 
-    def scale(self, owner: str, values: Mapping[str, Any]) -> Any:
-        """Return what an object's captured rgba is multiplied with, (4,): (colour·opacity, opacity)."""
+    def torch(self, device: Any) -> "FrozenGeometry":
+        """Return the same with torch tensors on a device."""
         import torch
 
-        one = self.fragments.rgba.new_ones(())
-        opacity = values.get(f"{owner}.opacity", one)
-        color = values.get(f"{owner}.color", one.expand(3))
-        return torch.cat([color * opacity, opacity.reshape(1)])
+        other = object.__new__(FrozenGeometry)
+        other.fragments = self.fragments.torch(device)
+        other.masks = {name: torch.as_tensor(mask, device=device) for name, mask in self.masks.items()}
+        return other
 
-    def arrays(self, values: Mapping[str, Any]) -> tuple[Any, Any]:
-        """Return rgba (F, 4) and thickness (F,), differentiable in the values (tensors)."""
-        import torch
-
+    def scaled(self, values: Mapping[str, Any]) -> Fragments:
+        """Return the fragments for parameter values, of the kind of the fragments; tensors keep their gradient."""
+        xp = _namespace(self.fragments.rgba)
         rgba, thickness = self.fragments.rgba, self.fragments.thickness
         # Selected by masks, not gathered by index: the gradient is then a plain sum, the same bits every time.
         for owner, mask in self.masks.items():
-            if f"{owner}.opacity" in values or f"{owner}.color" in values:
-                rgba = torch.where(mask[:, None], rgba * self.scale(owner, values), rgba)
+            opacity, color = values.get(f"{owner}.opacity"), values.get(f"{owner}.color")
+            if color is not None:
+                whole = xp.concatenate([color, xp.ones_like(color[:1])])
+                rgba = xp.where(mask[:, None], rgba * whole, rgba)
+            if opacity is not None:
+                rgba = xp.where(mask[:, None], rgba * opacity, rgba)
             if f"{owner}.thickness" in values:
-                thickness = torch.where(mask, thickness * values[f"{owner}.thickness"], thickness)
-        return rgba, thickness
-
-    def with_arrays(self, rgba: Any, thickness: Any) -> Fragments:
-        """Return the fragments with other colours and thicknesses."""
+                thickness = xp.where(mask, thickness * values[f"{owner}.thickness"], thickness)
         return replace(self.fragments, rgba=rgba, thickness=thickness)
 
 
@@ -83,27 +76,18 @@ class Problem:
     """
 
     def __init__(self, study: Study) -> None:
-        torch = need("torch", "torch", "Fitting")
         self.study, self.scene = study, study.scene
-        self.torch = torch
-        try:
-            self.device = torch.device(study.device)
-            torch.zeros(1, device=self.device)
-        except (RuntimeError, AssertionError) as error:
-            raise StudyError(
-                f"device: found {study.device!r}, which torch cannot use ({str(error).splitlines()[0]})"
-            ) from None
         self.reference = reference_image(study)
         self.channels = self.reference.shape[2]
         self.background = np.asarray(self.scene.background, np.float32)
-        self.frozen = FrozenGeometry(self.scene, study.variables, study.device) if study.is_global else None
+        self.frozen = FrozenGeometry(self.scene, study.variables) if study.is_global else None
 
     def values(self, coordinates: np.ndarray) -> dict[str, np.ndarray]:
         """Return the parameters for a vector of a method's coordinates."""
         values, first = {}, 0
         for variable in self.study.variables:
             last = first + variable.start.size
-            values[variable.name] = variable.outward(coordinates[first:last].reshape(variable.start.shape))
+            values[variable.name] = np.asarray(variable.outward(coordinates[first:last].reshape(variable.start.shape)))
             first = last
         return values
 
@@ -113,46 +97,55 @@ class Problem:
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the bounds of the vector."""
-        spans = [(variable.span, variable.start.size) for variable in self.study.variables]
-        return tuple(np.concatenate([np.full(count, span[side]) for span, count in spans]) for side in (0, 1))  # type: ignore[return-value]
-
-    def tensors(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Return values as float32 tensors on the study's device; tensors keep their gradient."""
-        return {
-            name: value.float()
-            if isinstance(value, self.torch.Tensor)
-            else self.torch.as_tensor(np.asarray(value, np.float32), device=self.device)
-            for name, value in values.items()
-        }
+        spans = [np.tile(variable.span, (variable.start.size, 1)) for variable in self.study.variables]
+        lower, upper = np.concatenate(spans).T
+        return lower, upper
 
     def over_background(self, image: Any) -> Any:
         """Return a premultiplied image, an array or a tensor, over the scene's background."""
         if not self.background.any():
             return image
-        ground = self.background
-        if isinstance(image, self.torch.Tensor):
-            ground = self.torch.as_tensor(ground, device=image.device)
-        return image + (1.0 - image[..., 3:]) * ground
+        return image + (1.0 - image[..., 3:]) * _like(self.background, image)
 
     def composite(self, fragments: Fragments, beta: Any) -> Any:
         """Composite fragments as the scene says, without its background."""
         scene = self.scene
         return composite(fragments, beta, max_layers=scene.layers, merge=scene.merge, mix=scene.mix)  # type: ignore[arg-type]
 
-    def image(self, values: Mapping[str, Any]) -> Any:
-        """Return the image for parameter values, (H, W, 4), differentiable in those that are tensors."""
-        tensors = self.tensors(values)
-        if self.frozen is None:
-            return render(self.scene, parameters=tensors)
-        fragments = self.frozen.with_arrays(*self.frozen.arrays(tensors))
-        return self.over_background(self.composite(fragments, tensors.get("beta", float(self.scene.beta))))
+    def image(self, values: Mapping[str, Any], frozen: FrozenGeometry | None = None) -> Any:
+        """Return the image for parameter values, (H, W, 4) float32.
+
+        Args:
+            values: arrays; or torch tensors, in which the image is then differentiable.
+            frozen: the frozen geometry as tensors, if the values are.
+        """
+        single = {name: _single(value) for name, value in values.items()}
+        frozen = frozen or self.frozen
+        if frozen is None:
+            return render(self.scene, parameters=single)
+        beta = single.get("beta", float(self.scene.beta))
+        return self.over_background(self.composite(frozen.scaled(single), beta))
 
     def residual(self, image: Any) -> Any:
         """Return image minus reference, (H, W, C), an array or a tensor."""
-        reference: Any = self.reference
-        if isinstance(image, self.torch.Tensor):
-            reference = self.torch.as_tensor(reference, device=image.device)
-        return image[..., : self.channels] - reference
+        return image[..., : self.channels] - _like(self.reference, image)
+
+
+def _namespace(array: Any) -> Any:
+    if kind_of(array) == "torch":
+        import torch
+
+        return torch
+    return np
+
+
+def _like(array: np.ndarray, image: Any) -> Any:
+    xp = _namespace(image)
+    return array if xp is np else xp.as_tensor(array, device=image.device)
+
+
+def _single(value: Any) -> Any:
+    return value.float() if kind_of(value) == "torch" else np.asarray(value, np.float32)
 
 
 def reference_image(study: Study) -> np.ndarray:

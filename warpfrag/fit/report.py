@@ -31,8 +31,9 @@ def draw_error(result: "FitResult", path: Path) -> None:
     height, width = result.reference.shape[:2]
     # Panels 4 inches wide, higher or lower as the image is, within reason.
     tall = float(np.clip(4.0 * height / width, 2.0, 7.0))
+    label = "|image − reference|, largest of the channels, linear light"
     with pyplot.rc_context(_STYLE):
-        figure, axes = pyplot.subplots(1, 2, figsize=(10.2, tall + 0.9), layout="constrained")
+        figure, axes = pyplot.subplots(1, 2, figsize=(10.4, tall + 0.4), layout="constrained")
         for axis, (title, error) in zip(axes, panels, strict=True):
             root = float(np.sqrt(np.mean(np.square(error, dtype=np.float64))))
             largest = error.max(axis=2)
@@ -42,8 +43,8 @@ def draw_error(result: "FitResult", path: Path) -> None:
             axis.set_title(f"Absolute error {title} (rms {root:.2g}, largest {largest.max():.2g})")
             axis.set_xticks([])
             axis.set_yticks([])
-            bar = figure.colorbar(shown, ax=axis, fraction=0.046, pad=0.02)
-            bar.set_label("largest |image − reference| of the channels (linear light)")
+            bar = figure.colorbar(shown, cax=axis.inset_axes([1.02, 0.0, 0.04, 1.0]))
+            bar.set_label(label)
             bar.formatter.set_powerlimits((-2, 3))
             bar.outline.set_linewidth(0.6)
         _save(figure, path)

@@ -1,6 +1,7 @@
 """`fit`: from a study to a result."""
 
 import os
+import time
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 from warpfrag.extras import need
 from warpfrag.fit.bar import progress_bar
 from warpfrag.fit.result import FitResult, plain_value
-from warpfrag.fit.session import FitError, Progress, Session, fingerprint
+from warpfrag.fit.session import CHECKPOINT, FitError, Progress, Session, fingerprint
 from warpfrag.fit.study import Study, load_study
 from warpfrag.saving import remove_partial
 
@@ -42,7 +43,7 @@ def fit(
         StudyError: the study cannot be run.
         FitError: the loss, a parameter or a gradient is not finite; or there is nothing to resume.
         KeyboardInterrupt: the user stopped it; the checkpoint is written.
-        ImportError: torch, SciPy or matplotlib is not installed.
+        ImportError: SciPy, torch (for Adam and L-BFGS) or matplotlib is not installed.
 
     Example:
         >>> wf.fit("scenes/studies/three_spheres.toml").found["beta"]
@@ -54,7 +55,9 @@ def fit(
         raise TypeError(f"study: got {type(study).__name__}, expected a Study or the path of a study file")
     if resume and output is None:
         raise FitError("resume: got it without output, expected the folder with the checkpoint")
-    need("torch", "torch", "Fitting")
+    if resume and not (Path(str(output)) / CHECKPOINT).is_file():
+        path = Path(str(output)) / CHECKPOINT
+        raise FitError(f"{path}: found no checkpoint to resume, expected one; start without resume")
     if output is not None:
         # What will be needed at the end is asked for at the beginning.
         need("matplotlib", "fit", "The report of a fit")
@@ -69,32 +72,28 @@ def fit(
 
 
 def _run(study: Study, resume: bool, output: Path | None, report: Callable[[Progress], None] | None) -> FitResult:
-    import torch
-
     from warpfrag.fit.descent import adam, lbfgs
     from warpfrag.fit.least_squares import least_squares
     from warpfrag.fit.outcome import assess
     from warpfrag.fit.problem import Problem
 
-    torch.manual_seed(study.seed)
+    started = time.monotonic()
     problem = Problem(study)
-    session = Session(study, fingerprint(study, problem.reference), output, report)
+    session = Session(study, fingerprint(study, problem.reference), output, report, started)
     if resume:
         session.load()
-    with torch.no_grad():
-        before = problem.image(problem.values(problem.start())).cpu().numpy()
+    before = problem.image(problem.values(problem.start()))
     methods: dict[str, Any] = {"least_squares": least_squares, "adam": adam, "lbfgs": lbfgs}
     with session.interruptible():
         outcome = methods[str(study.method)](problem, session)
         session.save()
     found = problem.values(outcome.coordinates)
-    with torch.no_grad():
-        after = problem.image(found).cpu().numpy()
+    after = problem.image(found)
     errors: dict[str, Any] | None = None
     condition: float | None = None
     undetermined: tuple[str, ...] = ()
     if outcome.compressed is not None and problem.frozen is not None:
-        covered = problem.frozen.covered.size * problem.channels
+        covered = np.count_nonzero(np.diff(problem.frozen.fragments.offsets)) * problem.channels
         certainty = assess(outcome.compressed, study.variables, problem.reference.size, covered)
         errors, condition, undetermined = {}, certainty.condition_number, certainty.undetermined
         first = 0

@@ -13,7 +13,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -24,7 +24,7 @@ from warpfrag.fit.parameters import values_words
 from warpfrag.fit.study import Study
 from warpfrag.saving import replacing
 
-CHECKPOINT = "checkpoint.pt"
+CHECKPOINT = "checkpoint.dat"
 # Of the file's layout; another one is not read.
 _VERSION = 1
 
@@ -42,7 +42,7 @@ class Progress:
         steps: most steps.
         loss: the loss of this step.
         parameters: the values of this step, by name.
-        message: something to tell the user, such as what Ctrl-C has begun.
+        message: something to tell the user, such as what Ctrl-C has begun; empty for a step that is done.
     """
 
     step: int
@@ -60,17 +60,24 @@ class Session:
         fingerprint: of the study, see `fingerprint`.
         folder: where the checkpoint goes; None writes none.
         report: called after each step.
+        started: when the fit began, by the monotonic clock.
     """
 
     def __init__(
-        self, study: Study, fingerprint: str, folder: Path | None, report: Callable[[Progress], None] | None
+        self,
+        study: Study,
+        fingerprint: str,
+        folder: Path | None,
+        report: Callable[[Progress], None] | None,
+        started: float,
     ) -> None:
         self.study, self.fingerprint, self.folder, self.report = study, fingerprint, folder, report
         self.losses: list[float] = []
         self.state: dict[str, Any] = {}
         self.seconds_before = 0.0
-        self.started = self.written = time.monotonic()
+        self.started, self.written = started, time.monotonic()
         self.interrupted = False
+        self.last: Progress | None = None
 
     @property
     def seconds(self) -> float:
@@ -81,33 +88,33 @@ class Session:
         """Take up the checkpoint.
 
         Raises:
-            FitError: there is none, it cannot be read, or it belongs to another study.
+            FitError: it cannot be read, or it belongs to another study.
         """
-        import torch
-
         assert self.folder is not None
         path = self.folder / CHECKPOINT
-        if not path.is_file():
-            raise FitError(f"{path}: found no checkpoint to resume, expected one; start without resume")
+        expected = "the one of this study (scene, reference, parameters, method); start without resume"
         try:
-            saved = torch.load(path, weights_only=True, map_location=self.study.device)
-            version, state = saved["version"], saved["state"]
+            saved = _read(path, self.study)
+            known = (int(saved.pop("version")), str(saved.pop("fingerprint"))) == (_VERSION, self.fingerprint)
+            seconds = float(saved.pop("seconds"))
         except Exception as error:
-            raise FitError(f"{path}: found a checkpoint that cannot be read ({type(error).__name__})") from error
-        if version != _VERSION or saved["fingerprint"] != self.fingerprint:
-            expected = "the one of this study (scene, reference, parameters, method); start without resume"
+            raise FitError(f"{path}: found a checkpoint that cannot be read, expected {expected}") from error
+        if not known:
             raise FitError(f"{path}: found the checkpoint of another study, expected {expected}")
-        self.state, self.seconds_before = state, saved["seconds"]
+        self.state, self.seconds_before = saved, seconds
 
     def save(self) -> None:
         """Write the checkpoint."""
         if self.folder is None:
             return
-        import torch
+        content = {**self.state, "version": _VERSION, "fingerprint": self.fingerprint, "seconds": self.seconds}
+        with replacing(self.folder / CHECKPOINT) as partial, partial.open("wb") as file:
+            if self.study.method == "least_squares":
+                np.savez(file, **content)
+            else:
+                import torch
 
-        content = {"version": _VERSION, "fingerprint": self.fingerprint, "state": self.state, "seconds": self.seconds}
-        with replacing(self.folder / CHECKPOINT) as partial:
-            torch.save(content, partial)
+                torch.save(content, file)
         self.written = time.monotonic()
 
     def step(self, loss: float, values: Mapping[str, Any], state: Callable[[], dict[str, Any]]) -> None:
@@ -126,14 +133,11 @@ class Session:
         if self.folder is not None and (due or self.interrupted):
             self.state = state()
             self.save()
-        self.tell(loss, values)
+        self.last = Progress(len(self.losses), int(self.study.steps or 0), loss, dict(values))
+        if self.report is not None:
+            self.report(self.last)
         if self.interrupted:
             raise KeyboardInterrupt
-
-    def tell(self, loss: float, values: Mapping[str, Any], message: str = "") -> None:
-        """Report progress."""
-        if self.report is not None:
-            self.report(Progress(len(self.losses), int(self.study.steps or 0), loss, dict(values), message))
 
     @contextlib.contextmanager
     def interruptible(self) -> Iterator[None]:
@@ -148,12 +152,24 @@ class Session:
             if self.interrupted or not self.losses:
                 raise KeyboardInterrupt
             self.interrupted = True
+            if self.report is not None and self.last is not None:
+                self.report(replace(self.last, message="stopping after this step (Ctrl-C again: at once)"))
 
         signal.signal(signal.SIGINT, stop)
         try:
             yield
         finally:
             signal.signal(signal.SIGINT, before)
+
+
+def _read(path: Path, study: Study) -> dict[str, Any]:
+    # Neither of the two runs code that a file may hold.
+    if study.method == "least_squares":
+        with np.load(path, allow_pickle=False) as file:
+            return dict(file)
+    import torch
+
+    return torch.load(path, weights_only=True, map_location=study.device)
 
 
 def check_finite(step: int, loss: float, values: Mapping[str, Any], gradients: Mapping[str, Any] | None = None) -> None:

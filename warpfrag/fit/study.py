@@ -48,7 +48,18 @@ Loss = Literal["l2", "l1", "huber"]
 DEFAULT_STEPS = {"least_squares": 100, "adam": 300, "lbfgs": 100}
 
 _RENDER = ("merge", "mix", "layers")
-_TOP: tuple[str, ...] = ("scene", "reference", "parameters", "loss", "delta", "method", "steps", "tolerance", "seed", "restarts")
+_TOP: tuple[str, ...] = (
+    "scene",
+    "reference",
+    "parameters",
+    "loss",
+    "delta",
+    "method",
+    "steps",
+    "tolerance",
+    "seed",
+    "restarts",
+)
 _TOP += ("learning_rate", "device", "checkpoint_seconds", "size", *_RENDER)
 _MOST_PIXELS, _MOST_STEPS = 65536, 10**9
 _P = re.compile(r"\s*([0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)\s*P\s*")

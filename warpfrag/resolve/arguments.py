@@ -11,13 +11,30 @@ from warpfrag.fragments import Fragments
 from warpfrag.interop.launch import Span, launch, worker_count
 from warpfrag.interop.operator import dtype_name, kind_of
 from warpfrag.operators import LOG_FLOOR, LOG_OPAQUE, MIX_AVERAGE, MIX_OPACITY, MIX_OPTICAL_DEPTH, Slab32, Slab64
-from warpfrag.resolve.walk import MERGE_NONE, MERGE_ORDER_INDEPENDENT, MERGE_SMOOTH, NO_FRAGMENT
+from warpfrag.resolve.walk import (
+    MERGE_NONE,
+    MERGE_ORDER_INDEPENDENT,
+    MERGE_SMOOTH,
+    NO_FRAGMENT,
+    Gradients32,
+    Gradients64,
+    Pixels32,
+    Pixels64,
+    Scratch32,
+    Scratch64,
+)
 
 Merge = Literal["none", "smooth", "order_independent"]
 Mix = Literal["opacity", "average", "optical_depth"]
 
 MERGES = {"none": MERGE_NONE, "smooth": MERGE_SMOOTH, "order_independent": MERGE_ORDER_INDEPENDENT}
 MIXES = {"opacity": MIX_OPACITY, "average": MIX_AVERAGE, "optical_depth": MIX_OPTICAL_DEPTH}
+
+# The structures of each precision.
+SLABS = {wp.float32: Slab32, wp.float64: Slab64}
+PIXELS = {wp.float32: Pixels32, wp.float64: Pixels64}
+GRADIENTS = {wp.float32: Gradients32, wp.float64: Gradients64}
+SCRATCH = {wp.float32: Scratch32, wp.float64: Scratch64}
 
 # Tensors and options that operators on fragments share, in this order.
 FRAGMENT_TENSORS = ("rgba", "depth", "thickness", "offsets", "beta", "opacity_sum")
@@ -90,9 +107,10 @@ def beta_array(beta: Any, like: Any, shape: tuple[int, ...]) -> Any:
     return beta.reshape((math.prod(beta.shape),))
 
 
-def slab_type(scalar: Any) -> Any:
-    """Return the slab structure of a precision."""
-    return Slab32 if scalar is wp.float32 else Slab64
+def vectors(array: wp.array) -> wp.array:
+    """Return an array of shape (n, 4) as one of n vectors, sharing its memory."""
+    dtype = wp.types.vector(4, array.dtype)
+    return wp.array(ptr=array.ptr, dtype=dtype, shape=array.shape[:1], device=array.device)
 
 
 class Walk:
@@ -109,51 +127,57 @@ class Walk:
         self.device = rgba.device
         self.pixel_count = offsets.shape[0] - 1
         self.length = max(1, longest_list(offsets, rgba.shape[0]))
-        self.arguments = [
-            *(rgba, depth, thickness, offsets, beta, self.optional(opacity_sum, 1)),
-            *(max_layers, MERGES[merge], MIXES[mix]),
-            self.scalar(LOG_OPAQUE if mix == "optical_depth" else LOG_FLOOR),
-        ]
+        self.pixels = PIXELS[self.scalar]()
+        self.pixels.rgba = vectors(rgba)
+        self.pixels.depth = depth
+        self.pixels.thickness = thickness
+        self.pixels.offsets = offsets
+        self.pixels.beta = beta
+        if opacity_sum is not None:
+            self.pixels.opacity_sum = opacity_sum
+        self.pixels.floor = LOG_OPAQUE if mix == "optical_depth" else LOG_FLOOR
+        self.pixels.max_layers = max_layers
+        self.pixels.merge_kind = MERGES[merge]
+        self.pixels.mix = MIXES[mix]
 
     def optional(self, array: wp.array | None, ndim: int) -> wp.array:
         """Return the array, or an empty one in place of None: kernels skip those."""
         return array if array is not None else wp.empty((0,) * ndim, dtype=self.scalar, device=self.device)
 
-    def scratch(self, rows: int, dtype: Any) -> wp.array:
-        """Return scratch memory, one value per thread and fragment of a pixel."""
-        return wp.empty((rows, self.length), dtype=dtype, device=self.device)
-
     def forward(self, kernel: wp.Kernel, outputs: Sequence[wp.array]) -> None:
-        """Run a kernel that takes the arguments, `order`, `invalid` and the outputs; raise if it finds invalid values."""
+        """Run a kernel that takes pixels, order, length, invalid and outputs; raise if it finds invalid values."""
         rows = worker_count(self.pixel_count, self.device, 4 * self.length)
+        order = wp.empty(rows * self.length, dtype=wp.int32, device=self.device)
         invalid = wp.array(np.full((rows, 2), NO_FRAGMENT, np.int32), device=self.device)
-        launch(
-            kernel,
-            self.pixel_count,
-            [*self.arguments, self.scratch(rows, wp.int32), invalid, *outputs],
-            self.device,
-            rows,
-        )
+        launch(kernel, self.pixel_count, [self.pixels, order, self.length, invalid, *outputs], self.device, rows)
         report_invalid(invalid, self.inputs)
 
     def backward(self, kernel: wp.Kernel, grads: Sequence[wp.array], grad_inputs: Sequence[wp.array | None]) -> None:
-        """Run a kernel that takes the arguments, the scratch of `replay`, the output and the input gradients."""
-        slab = slab_type(self.scalar)
-        rows = worker_count(self.pixel_count, self.device, (8 + 10 * wp.types.type_size_in_bytes(self.scalar)) * self.length)
+        """Run a kernel that takes pixels, scratch, output gradients and input gradients."""
+        slab = SLABS[self.scalar]
+        rows = worker_count(self.pixel_count, self.device, (8 + 21 * wp.types.type_size_in_bytes(self.scalar)) * self.length)
+        scratch = SCRATCH[self.scalar]()
+        scratch.length = self.length
+        for name, dtype in (
+            *(("order", wp.int32), ("step", wp.int32), ("fragment", slab), ("running", slab), ("through", self.scalar)),
+            *(("front", self.scalar), ("back", self.scalar)),
+        ):
+            setattr(scratch, name, wp.empty(rows * self.length, dtype=dtype, device=self.device))
         grad_rgba, grad_depth, grad_thickness, _, grad_beta, grad_opacity_sum = grad_inputs
-        beta_pixels = None
+        targets = GRADIENTS[self.scalar]()
+        if grad_rgba is not None:
+            targets.rgba = vectors(grad_rgba)
+        if grad_depth is not None:
+            targets.depth = grad_depth
+        if grad_thickness is not None:
+            targets.thickness = grad_thickness
+        if grad_opacity_sum is not None:
+            targets.opacity_sum = grad_opacity_sum
         if grad_beta is not None:
-            beta_pixels = wp.empty(self.pixel_count, dtype=self.scalar, device=self.device)
-        targets = [
-            self.optional(array, ndim)
-            for array, ndim in (
-                *((grad_rgba, 2), (grad_depth, 1), (grad_thickness, 1), (beta_pixels, 1), (grad_opacity_sum, 1)),
-            )
-        ]
-        scratch = [self.scratch(rows, dtype) for dtype in (wp.int32, wp.int32, slab, self.scalar)]
-        launch(kernel, self.pixel_count, [*self.arguments, *scratch, *grads, *targets], self.device, rows)
+            targets.beta = wp.empty(self.pixel_count, dtype=self.scalar, device=self.device)
+        launch(kernel, self.pixel_count, [self.pixels, scratch, *grads, targets], self.device, rows)
         if grad_beta is not None:
-            sum_beta(beta_pixels, grad_beta)
+            sum_beta(targets.beta, grad_beta)
 
 
 @wp.kernel(module="unique", enable_backward=False)

@@ -22,23 +22,28 @@ from warpfrag.interop.operator import Operator, apply
 from warpfrag.resolve.arguments import (
     FRAGMENT_DIFFERENTIABLE,
     FRAGMENT_TENSORS,
+    GRADIENTS,
     MERGE_OPTIONS,
+    PIXELS,
+    SCRATCH,
     Merge,
     Mix,
     Walk,
     check_options,
     fragment_inputs,
-    slab_type,
 )
 from warpfrag.resolve.walk import (
     STEP_START,
     choose_step,
     load_slab,
+    pixel_beta,
     replay,
     sort_pixel,
+    step_powers,
     store_grad,
     take_step,
     take_step_adjoint,
+    valid_beta,
     valid_fragment,
     zero_slab,
 )
@@ -46,7 +51,7 @@ from warpfrag.resolve.walk import (
 wp.set_module_options({"enable_backward": False})
 
 
-@wp.func
+@wp.func(inline=True)
 def store_layer(s: Any, pixel: int, layer: int, rgba: Any, depth: Any, thickness: Any, opacity_sum: Any):
     rgba[pixel, layer, 0] = s.c[0]
     rgba[pixel, layer, 1] = s.c[1]
@@ -57,24 +62,22 @@ def store_layer(s: Any, pixel: int, layer: int, rgba: Any, depth: Any, thickness
     opacity_sum[pixel, layer] = s.a * s.w
 
 
-@wp.func
-def load_layer_grad(
-    g: Any, s: Any, pixel: int, layer: int, rgba: Any, depth: Any, thickness: Any, opacity_sum: Any
-):
-    """Return the cotangent g of a layer's slab s plus what comes in through the layer's outputs; empty ones are zero."""
+@wp.func(inline=True)
+def load_layer_grad(s: Any, pixel: int, layer: int, rgba: Any, depth: Any, thickness: Any, opacity_sum: Any):
+    """Return the cotangent of a layer's slab s, given those of the layer's outputs; empty arrays stand for zeros."""
+    zero = type(s.a)(0.0)
+    g = zero_slab(zero)
     if rgba.shape[0] > 0:
-        g.c[0] = g.c[0] + rgba[pixel, layer, 0]
-        g.c[1] = g.c[1] + rgba[pixel, layer, 1]
-        g.c[2] = g.c[2] + rgba[pixel, layer, 2]
-        g.a = g.a + rgba[pixel, layer, 3]
+        g.c = wp.vector(rgba[pixel, layer, 0], rgba[pixel, layer, 1], rgba[pixel, layer, 2])
+        g.a = rgba[pixel, layer, 3]
     if depth.shape[0] > 0:
-        g.z = g.z + depth[pixel, layer]
+        g.z = depth[pixel, layer]
     if thickness.shape[0] > 0:
         g.z = g.z + thickness[pixel, layer]
-        g.f = g.f - thickness[pixel, layer]
+        g.f = -thickness[pixel, layer]
     if opacity_sum.shape[0] > 0:
         g.a = g.a + opacity_sum[pixel, layer] * s.w
-        g.w = g.w + opacity_sum[pixel, layer] * s.a
+        g.w = opacity_sum[pixel, layer] * s.a
     return g
 
 
@@ -83,137 +86,100 @@ def _forward_kernel(scalar: Any) -> wp.Kernel:
     @wp.kernel(module="unique", enable_backward=False)
     def resolve_fwd(
         span: Span,
-        rgba: wp.array2d(dtype=scalar),
-        depth: wp.array(dtype=scalar),
-        thickness: wp.array(dtype=scalar),
-        offsets: wp.array(dtype=int),
-        beta: wp.array(dtype=scalar),
-        opacity_sum: wp.array(dtype=scalar),
-        max_layers: int,
-        merge: int,
-        mix: int,
-        floor: scalar,
-        order: wp.array2d(dtype=int),
+        pixels: PIXELS[scalar],
+        order: wp.array(dtype=int),
+        length: int,
         invalid: wp.array2d(dtype=int),
-        layer_rgba: wp.array3d(dtype=scalar),
-        layer_depth: wp.array2d(dtype=scalar),
-        layer_thickness: wp.array2d(dtype=scalar),
-        layer_opacity_sum: wp.array2d(dtype=scalar),
+        rgba: wp.array3d(dtype=scalar),
+        depth: wp.array2d(dtype=scalar),
+        thickness: wp.array2d(dtype=scalar),
+        opacity_sum: wp.array2d(dtype=scalar),
         layer_count: wp.array(dtype=int),
     ):
-        row = span.worker + wp.tid()
+        base = (span.worker + wp.tid()) * length
         for pixel in range(span.begin + wp.tid(), span.end, span.stride):
-            begin = offsets[pixel]
-            end = offsets[pixel + 1]
-            pixel_beta = beta[wp.where(beta.shape[0] > 1, pixel, 0)]
-            if not (pixel_beta >= scalar(0.0) and pixel_beta <= scalar(1.0)):
+            begin = pixels.offsets[pixel]
+            count = pixels.offsets[pixel + 1] - begin
+            beta = pixel_beta(pixels, pixel)
+            if not valid_beta(pixels, pixel):
                 wp.atomic_min(invalid, span.worker, 1, pixel)
-            sort_pixel(depth, thickness, begin, end, order, row)
+            sort_pixel(pixels, begin, count, order, base)
             running = zero_slab(scalar(0.0))
             layer = int(0)
-            for position in range(end - begin):
-                fragment = order[row, position]
-                if not valid_fragment(rgba, depth, thickness, fragment):
+            for position in range(count):
+                fragment = order[base + position]
+                if not valid_fragment(pixels, fragment):
                     wp.atomic_min(invalid, span.worker, 0, fragment)
-                following = load_slab(rgba, depth, thickness, opacity_sum, fragment)
-                if position == 0:
+                following = load_slab(pixels, fragment)
+                step = int(STEP_START)
+                if position > 0:
+                    step = choose_step(pixels, running, following, layer)
+                if step == STEP_START:
+                    if position > 0:
+                        store_layer(running, pixel, layer, rgba, depth, thickness, opacity_sum)
+                        layer += 1
                     running = following
                 else:
-                    step = choose_step(running, following, layer, max_layers, merge)
-                    if step == STEP_START:
-                        store_layer(
-                            running, pixel, layer, layer_rgba, layer_depth, layer_thickness, layer_opacity_sum
-                        )
-                        running = following
-                        layer += 1
-                    else:
-                        running = take_step(step, running, following, pixel_beta, merge, mix, floor)
-            if end > begin:
-                store_layer(running, pixel, layer, layer_rgba, layer_depth, layer_thickness, layer_opacity_sum)
+                    front, back = step_powers(pixels, step, running, following)
+                    running = take_step(pixels, step, running, following, beta, front, back)
+            if count > 0:
+                store_layer(running, pixel, layer, rgba, depth, thickness, opacity_sum)
                 layer += 1
             layer_count[pixel] = layer
-            for unused in range(layer, max_layers):
-                store_layer(
-                    zero_slab(scalar(0.0)),
-                    pixel,
-                    unused,
-                    layer_rgba,
-                    layer_depth,
-                    layer_thickness,
-                    layer_opacity_sum,
-                )
+            for unused in range(layer, pixels.max_layers):
+                store_layer(zero_slab(scalar(0.0)), pixel, unused, rgba, depth, thickness, opacity_sum)
 
     return resolve_fwd
 
 
 @cache
 def _backward_kernel(scalar: Any) -> wp.Kernel:
-    Slab = slab_type(scalar)
-
     @wp.kernel(module="unique", enable_backward=False)
     def resolve_bwd(
         span: Span,
-        rgba: wp.array2d(dtype=scalar),
-        depth: wp.array(dtype=scalar),
-        thickness: wp.array(dtype=scalar),
-        offsets: wp.array(dtype=int),
-        beta: wp.array(dtype=scalar),
-        opacity_sum: wp.array(dtype=scalar),
-        max_layers: int,
-        merge: int,
-        mix: int,
-        floor: scalar,
-        order: wp.array2d(dtype=int),
-        steps: wp.array2d(dtype=int),
-        states: wp.array2d(dtype=Slab),
-        through: wp.array2d(dtype=scalar),
-        grad_layer_rgba: wp.array3d(dtype=scalar),
-        grad_layer_depth: wp.array2d(dtype=scalar),
-        grad_layer_thickness: wp.array2d(dtype=scalar),
-        grad_layer_opacity_sum: wp.array2d(dtype=scalar),
-        grad_rgba: wp.array2d(dtype=scalar),
-        grad_depth: wp.array(dtype=scalar),
-        grad_thickness: wp.array(dtype=scalar),
-        grad_beta: wp.array(dtype=scalar),
-        grad_opacity_sum: wp.array(dtype=scalar),
+        pixels: PIXELS[scalar],
+        scratch: SCRATCH[scalar],
+        grad_rgba: wp.array3d(dtype=scalar),
+        grad_depth: wp.array2d(dtype=scalar),
+        grad_thickness: wp.array2d(dtype=scalar),
+        grad_opacity_sum: wp.array2d(dtype=scalar),
+        grads: GRADIENTS[scalar],
     ):
-        row = span.worker + wp.tid()
+        base = (span.worker + wp.tid()) * scratch.length
         for pixel in range(span.begin + wp.tid(), span.end, span.stride):
-            begin = offsets[pixel]
-            end = offsets[pixel + 1]
-            pixel_beta = beta[wp.where(beta.shape[0] > 1, pixel, 0)]
-            layer = replay(
-                rgba, depth, thickness, opacity_sum, begin, end, pixel_beta, max_layers, merge, mix, floor,
-                order, steps, states, through, row,
-            )  # fmt: skip
-            grad = zero_slab(scalar(0.0))
-            beta_sum = scalar(0.0)
+            count = pixels.offsets[pixel + 1] - pixels.offsets[pixel]
+            beta = pixel_beta(pixels, pixel)
+            layer = replay(pixels, pixel, scratch, base)
+            g = zero_slab(scalar(0.0))
+            g_beta = scalar(0.0)
             ends_layer = bool(True)
-            for back in range(end - begin):
-                position = end - begin - 1 - back
-                fragment = order[row, position]
+            for back in range(count):
+                at = base + count - 1 - back
+                step = scratch.step[at]
                 if ends_layer:
                     layer -= 1
-                    grad = load_layer_grad(
-                        zero_slab(scalar(0.0)), states[row, position], pixel, layer,
-                        grad_layer_rgba, grad_layer_depth, grad_layer_thickness, grad_layer_opacity_sum,
-                    )  # fmt: skip
-                step = steps[row, position]
-                ends_layer = step == STEP_START
-                grad_fragment = grad
-                if step != STEP_START:
-                    following = load_slab(rgba, depth, thickness, opacity_sum, fragment)
-                    grad_running, grad_following, grad_step = take_step_adjoint(
-                        step, grad, states[row, position - 1], following, pixel_beta, merge, mix, floor
+                    g = load_layer_grad(
+                        scratch.running[at], pixel, layer, grad_rgba, grad_depth, grad_thickness, grad_opacity_sum
                     )
-                    grad = grad_running
-                    grad_fragment = grad_following
-                    beta_sum += grad_step
-                store_grad(
-                    grad_fragment, fragment, rgba, opacity_sum, grad_rgba, grad_depth, grad_thickness, grad_opacity_sum
-                )
-            if grad_beta.shape[0] > 0:
-                grad_beta[pixel] = beta_sum
+                ends_layer = step == STEP_START
+                g_fragment = g
+                if step != STEP_START:
+                    g_running, g_following, g_step = take_step_adjoint(
+                        pixels,
+                        step,
+                        g,
+                        scratch.running[at - 1],
+                        scratch.fragment[at],
+                        beta,
+                        scratch.front[at],
+                        scratch.back[at],
+                    )
+                    g = g_running
+                    g_fragment = g_following
+                    g_beta += g_step
+                store_grad(g_fragment, pixels, scratch.order[at], grads)
+            if grads.beta.shape[0] > 0:
+                grads.beta[pixel] = g_beta
 
     return resolve_bwd
 

@@ -11,16 +11,18 @@ from typing import Any
 import warp as wp
 
 from warpfrag.operators import (
-    add_gains_gradient,
+    Slab32,
+    Slab64,
     log_transmittance,
-    merge,
-    merge_adjoint,
+    ofm,
+    ofm_adjoint,
     over,
     over_adjoint,
     overlap,
+    sfm,
+    sfm_adjoint,
+    sfm_powers,
     slab,
-    smooth_gains,
-    smooth_gains_adjoint,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -36,191 +38,271 @@ STEP_TAIL = wp.constant(2)
 NO_FRAGMENT = wp.constant(2147483647)
 
 
-@wp.func
-def precedes(depth: Any, thickness: Any, i: int, j: int):
+@wp.struct
+class Pixels32:
+    """The fragments of all pixels, and how to merge them. Optional arrays are empty where there is nothing."""
+
+    rgba: wp.array[wp.vec4f]
+    depth: wp.array[wp.float32]
+    thickness: wp.array[wp.float32]
+    offsets: wp.array[wp.int32]
+    beta: wp.array[wp.float32]
+    opacity_sum: wp.array[wp.float32]
+    floor: wp.float32
+    max_layers: wp.int32
+    merge_kind: wp.int32
+    mix: wp.int32
+
+
+@wp.struct
+class Pixels64:
+    """`Pixels32` in double precision."""
+
+    rgba: wp.array[wp.vec4d]
+    depth: wp.array[wp.float64]
+    thickness: wp.array[wp.float64]
+    offsets: wp.array[wp.int32]
+    beta: wp.array[wp.float64]
+    opacity_sum: wp.array[wp.float64]
+    floor: wp.float64
+    max_layers: wp.int32
+    merge_kind: wp.int32
+    mix: wp.int32
+
+
+@wp.struct
+class Gradients32:
+    """Gradients of the fragments and, per pixel, of beta; those nobody wants are empty."""
+
+    rgba: wp.array[wp.vec4f]
+    depth: wp.array[wp.float32]
+    thickness: wp.array[wp.float32]
+    beta: wp.array[wp.float32]
+    opacity_sum: wp.array[wp.float32]
+
+
+@wp.struct
+class Gradients64:
+    """`Gradients32` in double precision."""
+
+    rgba: wp.array[wp.vec4d]
+    depth: wp.array[wp.float64]
+    thickness: wp.array[wp.float64]
+    beta: wp.array[wp.float64]
+    opacity_sum: wp.array[wp.float64]
+
+
+@wp.struct
+class Scratch32:
+    """A thread's record of one pixel, by position in depth order; each thread has a row of `length` entries.
+
+    `order`: fragment; `step`: what happened to it; `fragment`: it as a slab; `running`: the running slab after it;
+    `front`, `back`: its `step_powers`; `through`: transmittance of all layers before the running one.
+    """
+
+    length: wp.int32
+    order: wp.array[wp.int32]
+    step: wp.array[wp.int32]
+    fragment: wp.array[Slab32]
+    running: wp.array[Slab32]
+    front: wp.array[wp.float32]
+    back: wp.array[wp.float32]
+    through: wp.array[wp.float32]
+
+
+@wp.struct
+class Scratch64:
+    """`Scratch32` in double precision."""
+
+    length: wp.int32
+    order: wp.array[wp.int32]
+    step: wp.array[wp.int32]
+    fragment: wp.array[Slab64]
+    running: wp.array[Slab64]
+    front: wp.array[wp.float64]
+    back: wp.array[wp.float64]
+    through: wp.array[wp.float64]
+
+
+@wp.func(inline=True)
+def precedes(pixels: Any, i: int, j: int):
     """Tell whether fragment i comes before j: by depth, then front, then submission."""
-    if depth[i] != depth[j]:
-        return depth[i] < depth[j]
-    front_i = depth[i] - thickness[i]
-    front_j = depth[j] - thickness[j]
+    z_i = pixels.depth[i]
+    z_j = pixels.depth[j]
+    if z_i != z_j:
+        return z_i < z_j
+    front_i = z_i - pixels.thickness[i]
+    front_j = z_j - pixels.thickness[j]
     if front_i != front_j:
         return front_i < front_j
     return i < j
 
 
-@wp.func
-def sort_pixel(depth: Any, thickness: Any, begin: int, end: int, order: wp.array2d[int], row: int):
-    """Write the fragments begin : end to `order[row]`, sorted: one comparison each if they are already, else Shell's.
+@wp.func(inline=True)
+def sort_pixel(pixels: Any, begin: int, count: int, order: wp.array[wp.int32], base: int):
+    """Write the fragments of a pixel to `order`, sorted: one comparison each if they are already, else Shell's.
 
     The gaps are Knuth's (1, 4, 13, ...); short lists start at gap 1, an insertion sort.
     """
     sorted = bool(True)
-    for fragment in range(begin, end):
-        order[row, fragment - begin] = fragment
-        if fragment > begin:
-            sorted = sorted and not precedes(depth, thickness, fragment, fragment - 1)
+    for position in range(count):
+        order[base + position] = begin + position
+        if position > 0 and precedes(pixels, begin + position, begin + position - 1):
+            sorted = False
     if not sorted:
-        count = end - begin
         gap = int(1)
         while 9 * gap < count:
             gap = 3 * gap + 1
         while gap > 0:
-            for i in range(gap, count):
-                fragment = order[row, i]
-                j = int(i)
-                while j >= gap and precedes(depth, thickness, fragment, order[row, j - gap]):
-                    order[row, j] = order[row, j - gap]
+            for position in range(gap, count):
+                fragment = order[base + position]
+                j = int(position)
+                while j >= gap and precedes(pixels, fragment, order[base + j - gap]):
+                    order[base + j] = order[base + j - gap]
                     j -= gap
-                order[row, j] = fragment
+                order[base + j] = fragment
             gap = gap // 3
 
 
-@wp.func
-def load_slab(rgba: Any, depth: Any, thickness: Any, opacity_sum: Any, fragment: int):
+@wp.func(inline=True)
+def load_slab(pixels: Any, fragment: int):
     """Return a fragment as a slab."""
-    a = rgba[fragment, 3]
+    rgba = pixels.rgba[fragment]
+    a = rgba[3]
     one = type(a)(1.0)
     weight = one
-    if opacity_sum.shape[0] > 0 and a > type(a)(0.0):
-        weight = opacity_sum[fragment] / a
-    z = depth[fragment]
-    c = wp.vector(rgba[fragment, 0], rgba[fragment, 1], rgba[fragment, 2])
-    return slab(c, a, one - a, log_transmittance(a), weight, z - thickness[fragment], z)
+    if pixels.opacity_sum.shape[0] > 0 and a > type(a)(0.0):
+        weight = pixels.opacity_sum[fragment] / a
+    log_t = type(a)(0.0)
+    if pixels.merge_kind == MERGE_SMOOTH:
+        # Nothing else reads it, and it costs a third of all the rest.
+        log_t = log_transmittance(a)
+    z = pixels.depth[fragment]
+    return slab(wp.vector(rgba[0], rgba[1], rgba[2]), a, one - a, log_t, weight, z - pixels.thickness[fragment], z)
 
 
-@wp.func
-def store_grad(
-    grad: Any,
-    fragment: int,
-    rgba: Any,
-    opacity_sum: Any,
-    grad_rgba: Any,
-    grad_depth: Any,
-    grad_thickness: Any,
-    grad_opacity_sum: Any,
-):
-    """Write the gradient of a fragment, given that of the slab that `load_slab` made of it; empty arrays are skipped."""
-    a = rgba[fragment, 3]
+@wp.func(inline=True)
+def store_grad(g: Any, pixels: Any, fragment: int, grads: Any):
+    """Write the gradient of a fragment, given that of the slab that `load_slab` made of it."""
+    a = pixels.rgba[fragment][3]
     zero = type(a)(0.0)
     t = type(a)(1.0) - a
-    grad_a = grad.a - grad.t
+    grad_a = g.a - g.t
     if t > zero:
-        grad_a -= grad.l / t
-    if opacity_sum.shape[0] > 0:
+        grad_a -= g.l / t
+    if pixels.opacity_sum.shape[0] > 0:
         grad_sum = zero
         if a > zero:
-            grad_sum = grad.w / a
-            grad_a -= grad_sum * opacity_sum[fragment] / a
-        if grad_opacity_sum.shape[0] > 0:
-            grad_opacity_sum[fragment] = grad_sum
-    if grad_rgba.shape[0] > 0:
-        grad_rgba[fragment, 0] = grad.c[0]
-        grad_rgba[fragment, 1] = grad.c[1]
-        grad_rgba[fragment, 2] = grad.c[2]
-        grad_rgba[fragment, 3] = grad_a
-    if grad_depth.shape[0] > 0:
-        grad_depth[fragment] = grad.z + grad.f
-    if grad_thickness.shape[0] > 0:
-        grad_thickness[fragment] = -grad.f
+            grad_sum = g.w / a
+            grad_a -= grad_sum * pixels.opacity_sum[fragment] / a
+        if grads.opacity_sum.shape[0] > 0:
+            grads.opacity_sum[fragment] = grad_sum
+    if grads.rgba.shape[0] > 0:
+        grads.rgba[fragment] = wp.vector(g.c[0], g.c[1], g.c[2], grad_a)
+    if grads.depth.shape[0] > 0:
+        grads.depth[fragment] = g.z + g.f
+    if grads.thickness.shape[0] > 0:
+        grads.thickness[fragment] = -g.f
 
 
-@wp.func
-def valid_fragment(rgba: Any, depth: Any, thickness: Any, fragment: int):
+@wp.func(inline=True)
+def valid_fragment(pixels: Any, fragment: int):
     """Tell whether a fragment's values are finite and in range."""
-    a = rgba[fragment, 3]
-    zero = type(a)(0.0)
-    # Adding zero times everything: one NaN or infinity anywhere makes the sum NaN.
-    sum = zero * (rgba[fragment, 0] + rgba[fragment, 1] + rgba[fragment, 2] + depth[fragment] + thickness[fragment])
-    return sum == zero and a >= zero and a <= type(a)(1.0) and thickness[fragment] >= zero
+    rgba = pixels.rgba[fragment]
+    t = pixels.thickness[fragment]
+    zero = type(t)(0.0)
+    # Zero times everything: one NaN or infinity anywhere makes the sum NaN.
+    sum = zero * (rgba[0] + rgba[1] + rgba[2] + pixels.depth[fragment] + t)
+    return sum == zero and rgba[3] >= zero and rgba[3] <= type(t)(1.0) and t >= zero
 
 
-@wp.func
-def choose_step(running: Any, following: Any, layer: int, max_layers: int, merge_kind: int):
+@wp.func(inline=True)
+def pixel_beta(pixels: Any, pixel: int):
+    """Return beta, which is one for all or one for each pixel."""
+    return pixels.beta[wp.where(pixels.beta.shape[0] > 1, pixel, 0)]
+
+
+@wp.func(inline=True)
+def valid_beta(pixels: Any, pixel: int):
+    """Tell whether a pixel's beta is in range."""
+    beta = pixel_beta(pixels, pixel)
+    return beta >= type(beta)(0.0) and beta <= type(beta)(1.0)
+
+
+@wp.func(inline=True)
+def choose_step(pixels: Any, running: Any, following: Any, layer: int):
     """Return what happens to the slab that follows the running one, which is to become layer number `layer`."""
-    if merge_kind != MERGE_NONE and overlap(running, following):
+    if pixels.merge_kind != MERGE_NONE and overlap(running, following):
         return STEP_MERGE
-    if layer < max_layers - 1:
+    if layer < pixels.max_layers - 1:
         return STEP_START
     return STEP_TAIL
 
 
-@wp.func
-def take_step(step: int, a: Any, b: Any, beta: Any, merge_kind: int, mix: int, floor: Any):
-    """Return the running slab after a step that is not a start."""
+@wp.func(inline=True)
+def step_powers(pixels: Any, step: int, a: Any, b: Any):
+    """Return the `sfm_powers` of a step, which is of no other kind if they are to mean anything."""
+    one = type(pixels.floor)(1.0)
+    if step == STEP_MERGE and pixels.merge_kind == MERGE_SMOOTH:
+        return sfm_powers(a, b, pixels.floor)
+    return one, one
+
+
+@wp.func(inline=True)
+def take_step(pixels: Any, step: int, a: Any, b: Any, beta: Any, front: Any, back: Any):
+    """Return the running slab after a step that is not a start, given its `step_powers`."""
     if step == STEP_TAIL:
         return over(a, b)
-    x = type(beta)(1.0)
-    y = type(beta)(1.0)
-    v = type(beta)(0.0)
-    if merge_kind == MERGE_SMOOTH:
-        x, y, v = smooth_gains(a, b, beta, floor)
-    return merge(a, b, x, y, v, mix)
+    if pixels.merge_kind == MERGE_SMOOTH:
+        return sfm(a, b, beta, pixels.mix, front, back)
+    return ofm(a, b, pixels.mix)
 
 
-@wp.func
-def take_step_adjoint(step: int, g: Any, a: Any, b: Any, beta: Any, merge_kind: int, mix: int, floor: Any):
-    """Return the gradients in a, b and beta of <g, take_step(step, a, b, ...)>."""
-    zero = type(beta)(0.0)
-    if step == STEP_TAIL:
-        over_a, over_b = over_adjoint(g, a, b)
-        return over_a, over_b, zero
-    x = type(beta)(1.0)
-    y = type(beta)(1.0)
-    v = type(beta)(0.0)
-    if merge_kind == MERGE_SMOOTH:
-        x, y, v = smooth_gains(a, b, beta, floor)
-    merge_a, merge_b, g_x, g_y, g_v = merge_adjoint(g, a, b, x, y, v, mix)
-    if merge_kind != MERGE_SMOOTH:
-        return merge_a, merge_b, zero
-    gains_a, gains_b, g_beta = smooth_gains_adjoint(g_x, g_y, g_v, a, b, beta, floor)
-    return add_gains_gradient(merge_a, gains_a), add_gains_gradient(merge_b, gains_b), g_beta
+@wp.func(inline=True)
+def take_step_adjoint(pixels: Any, step: int, g: Any, a: Any, b: Any, beta: Any, front: Any, back: Any):
+    """Return the gradients in a, b and beta of <g, take_step(...)>."""
+    if step == STEP_MERGE and pixels.merge_kind == MERGE_SMOOTH:
+        return sfm_adjoint(g, a, b, beta, pixels.mix, pixels.floor, front, back)
+    if step == STEP_MERGE:
+        ofm_a, ofm_b = ofm_adjoint(g, a, b, pixels.mix)
+        return ofm_a, ofm_b, type(beta)(0.0)
+    over_a, over_b = over_adjoint(g, a, b)
+    return over_a, over_b, type(beta)(0.0)
 
 
-@wp.func
+@wp.func(inline=True)
 def zero_slab(zero: Any):
     """Return the slab whose every component is the given zero; its type sets the precision."""
     return slab(wp.vector(zero, zero, zero), zero, zero, zero, zero, zero, zero)
 
 
-@wp.func
-def replay(
-    rgba: Any,
-    depth: Any,
-    thickness: Any,
-    opacity_sum: Any,
-    begin: int,
-    end: int,
-    beta: Any,
-    max_layers: int,
-    merge_kind: int,
-    mix: int,
-    floor: Any,
-    order: wp.array2d[int],
-    steps: wp.array2d[int],
-    states: Any,
-    through: Any,
-    row: int,
-):
-    """Walk through a pixel's fragments and keep, per position: step, running slab after it, transmittance up to its layer.
-
-    Returns the number of layers.
-    """
-    sort_pixel(depth, thickness, begin, end, order, row)
+@wp.func(inline=True)
+def replay(pixels: Any, pixel: int, scratch: Any, base: int):
+    """Walk through a pixel's fragments, record every position in `scratch`, and return the number of layers."""
+    begin = pixels.offsets[pixel]
+    count = pixels.offsets[pixel + 1] - begin
+    beta = pixel_beta(pixels, pixel)
+    sort_pixel(pixels, begin, count, scratch.order, base)
     layer = int(0)
-    transmittance = type(beta)(1.0)
-    for position in range(end - begin):
-        following = load_slab(rgba, depth, thickness, opacity_sum, order[row, position])
+    through = type(beta)(1.0)
+    running = zero_slab(type(beta)(0.0))
+    for position in range(count):
+        following = load_slab(pixels, scratch.order[base + position])
         step = int(STEP_START)
         if position > 0:
-            step = choose_step(states[row, position - 1], following, layer, max_layers, merge_kind)
+            step = choose_step(pixels, running, following, layer)
         if step == STEP_START:
             if position > 0:
                 layer += 1
-                transmittance *= states[row, position - 1].t
-            states[row, position] = following
+                through *= running.t
+            running = following
         else:
-            states[row, position] = take_step(step, states[row, position - 1], following, beta, merge_kind, mix, floor)
-        steps[row, position] = step
-        through[row, position] = transmittance
-    return wp.where(end > begin, layer + 1, 0)
-
+            front, back = step_powers(pixels, step, running, following)
+            running = take_step(pixels, step, running, following, beta, front, back)
+            scratch.front[base + position] = front
+            scratch.back[base + position] = back
+        scratch.step[base + position] = step
+        scratch.fragment[base + position] = following
+        scratch.running[base + position] = running
+        scratch.through[base + position] = through
+    return wp.where(count > 0, layer + 1, 0)

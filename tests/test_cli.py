@@ -1,0 +1,181 @@
+"""The command line: what it writes, its one line for whatever goes wrong, and Ctrl-C."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_study import SCENE
+
+from warpfrag.cli import main
+from warpfrag.images import read_image
+
+STUDY = """
+scene = "scene.toml"
+method = "adam"
+steps = 60
+checkpoint_seconds = 0
+[reference.true]
+ball.color = [0.2, 0.4, 0.6]
+[parameters]
+ball.color = [0.8, 0.8, 0.8]
+ball.opacity = 0.7
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """The working folder, with a scene and a study in it."""
+    (tmp_path / "scene.toml").write_text(SCENE)
+    (tmp_path / "study.toml").write_text(STUDY)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_render_writes_an_image(folder):
+    """Suffix and bits decide on the format, --size on the size."""
+    for name, options in (("a.png", []), ("b.png", ["--bits", "16"]), ("a.exr", []), ("c.png", ["--size", "12x10"])):
+        assert main(["render", "scene.toml", "-o", name, *options]) == 0
+    assert read_image("c.png").shape == (10, 12, 4)
+    np.testing.assert_allclose(read_image("b.png"), read_image("a.exr"), atol=1e-4)
+    np.testing.assert_allclose(read_image("a.png"), read_image("a.exr"), atol=1e-2)
+
+
+def test_render_overrides(folder):
+    """Each override gives the image of a scene file that says the same."""
+    changes = [
+        (["--beta", "0.1"], ("beta = 0.5", "beta = 0.1")),
+        (["--set", "beta=0.1"], ("beta = 0.5", "beta = 0.1")),
+        (["--thickness", "0.7", "--set", "disc.thickness=2P"], None),
+        (["--merge", "none"], ("beta = 0.5", 'beta = 0.5\nmerge = "none"')),
+        (["--layers", "1", "--mix", "average"], ("beta = 0.5", 'beta = 0.5\nlayers = 1\nmix = "average"')),
+        (["--background", "#336699"], ("[1, 1, 1]", '"#336699"')),
+        (["--background", "0.1,0.2,0.3,0.5"], ("[1, 1, 1]", "[0.1, 0.2, 0.3, 0.5]")),
+        (["--background", "none"], ("[1, 1, 1]", "[0, 0, 0, 0]")),
+        (["--set", "ball.opacity=0.5", "--set", "ball.color=#ff0000"], None),
+    ]
+    base = SCENE.replace("segments = 12", "segments = 12\nopacity = 0.8")
+    (folder / "scene.toml").write_text(base)
+    for options, change in changes:
+        assert main(["render", "scene.toml", "-o", "a.npy", *options]) == 0
+        if change is not None:
+            assert change[0] in base
+            (folder / "changed.toml").write_text(base.replace(*change))
+            assert main(["render", "changed.toml", "-o", "b.npy"]) == 0
+            np.testing.assert_array_equal(np.load("a.npy"), np.load("b.npy"))
+    assert np.load("a.npy")[8, 12, :3].tolist() == pytest.approx([1.0, 0.25, 0.25], abs=0.3)
+
+
+MISTAKES = [
+    (["rendr"], "No such command 'rendr'"),
+    (["render", "scene.toml"], "Missing option"),
+    (["render", "none.toml", "-o", "a.png"], "none.toml: found no such file"),
+    (["render", "scene.toml", "-o", "a.jpg"], "a.jpg: found the suffix .jpg"),
+    (["render", "scene.toml", "-o", "no/a.png"], "found no folder no"),
+    (["render", "scene.toml", "-o", "a.png", "--bits", "12"], "bits: found 12"),
+    (["render", "scene.toml", "-o", "a.png", "--beta", "2"], "beta: found 2"),
+    (["render", "scene.toml", "-o", "a.png", "--beta", "x"], "--beta"),
+    (["render", "scene.toml", "-o", "a.png", "--size", "12"], "--size: found '12'"),
+    (["render", "scene.toml", "-o", "a.png", "--merge", "smoth"], "merge: found"),
+    (["render", "scene.toml", "-o", "a.png", "--layers", "0"], "layers: found 0"),
+    (["render", "scene.toml", "-o", "a.png", "--thickness", "2Q"], "--thickness: found '2Q'"),
+    (["render", "scene.toml", "-o", "a.png", "--thickness", "-1"], "thickness: found -1"),
+    (["render", "scene.toml", "-o", "a.png", "--background", "red"], "--background: found 'red'"),
+    (["render", "scene.toml", "-o", "a.png", "--set", "beta"], "expected NAME=VALUE"),
+    (["render", "scene.toml", "-o", "a.png", "--set", "bal.opacity=1"], 'did you mean "ball.opacity"?'),
+    (["render", "scene.toml", "-o", "a.png", "--set", "ball.opacity=2"], "ball.opacity: found 2"),
+    (["fit", "none.toml"], "none.toml: found no such file"),
+    (["fit", "study.toml", "--steps", "0"], "steps: found 0"),
+    (["fit", "study.toml", "--resume"], "found no checkpoint to resume"),
+]
+
+
+@pytest.mark.parametrize(("words", "message"), MISTAKES)
+def test_mistakes_get_one_line(folder, capsys, words, message):
+    """One line on standard error, status 2, and no image."""
+    assert main(words) == 2
+    captured = capsys.readouterr()
+    assert message in captured.err
+    assert captured.err.count("\n") == 1
+    assert captured.err.startswith("warpfrag: ")
+    assert captured.out == ""
+    assert not list(folder.glob("**/*.png"))
+
+
+def test_unexpected_errors_get_one_line(folder, capsys, monkeypatch):
+    """An error nobody thought of is one line too, with its kind; a traceback comes on request."""
+
+    def fail(path):
+        raise RuntimeError("two\nlines")
+
+    monkeypatch.setattr("warpfrag.scene.files.load_scene", fail)
+    words = ["render", "scene.toml", "-o", "a.png"]
+    assert main(words) == 2
+    assert capsys.readouterr().err == "warpfrag: RuntimeError: two lines\n"
+    monkeypatch.setenv("WARPFRAG_TRACEBACK", "1")
+    with pytest.raises(RuntimeError):
+        main(words)
+
+
+def test_version_and_help(capsys):
+    """Both print and end well."""
+    assert main(["--version"]) == 0
+    assert main(["--help"]) == 0
+    assert main([]) == 0
+    assert "render" in capsys.readouterr().out
+
+
+def test_fit_writes_its_folder(folder, capsys):
+    """The default folder is results/<study>; the last line names it."""
+    assert main(["fit", "study.toml", "--steps", "3", "--size", "12x8"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "results in results/study"
+    content = json.loads(Path("results/study/result.json").read_text())
+    assert (content["steps"], content["size"]) == (3, [12, 8])
+    assert content["true"]["ball.color"] == pytest.approx([0.2, 0.4, 0.6])
+
+
+def start(*words: str) -> subprocess.Popen:
+    """Start the command line in a process of its own."""
+    command = [sys.executable, "-m", "warpfrag.cli", *words]
+    return subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+
+def wait_for(path: Path, process: subprocess.Popen, newer_than: float = 0.0) -> None:
+    """Wait until a file is there, and newer than a time."""
+    while not path.is_file() or path.stat().st_mtime <= newer_than:
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.005)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals are those of POSIX")
+def test_interrupted_and_killed_fit_ends_at_the_same_bits(folder):
+    """After Ctrl-C, then kill -9, a resumed fit ends where an unbroken one does; Ctrl-C says how to go on."""
+    text = STUDY.replace("steps = 60", "steps = 2000\ntolerance = 0")
+    (folder / "study.toml").write_text(text)
+    checkpoint = folder / "out" / "checkpoint.dat"
+    process = start("fit", "study.toml", "-o", "out")
+    wait_for(checkpoint, process)
+    process.send_signal(signal.SIGINT)
+    _, told = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert told.splitlines()[-1] == "warpfrag: stopped; go on with: warpfrag fit study.toml -o out --resume"
+    written = checkpoint.stat().st_mtime
+    process = start("fit", "study.toml", "-o", "out", "--resume")
+    wait_for(checkpoint, process, written)
+    process.kill()
+    process.communicate()
+    assert not (folder / "out" / "result.json").exists()
+    # Few steps are left to do, so that the test is short.
+    for where, options in (("out", ["--resume"]), ("whole", [])):
+        process = start("fit", "study.toml", "-o", where, "--steps", "150", *options)
+        _, told = process.communicate(timeout=120)
+        assert process.returncode == 0, told
+    results = [json.loads((folder / where / "result.json").read_text()) for where in ("out", "whole")]
+    assert len(results[1]["losses"]) == 150
+    assert results[0]["losses"][:150] == results[1]["losses"]
+    assert not list(folder.glob("**/.*partial*"))

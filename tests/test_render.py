@@ -1,0 +1,222 @@
+"""From a scene to its image: options, background, gradients, and bands of rows under a memory limit."""
+
+import numpy as np
+import pytest
+import torch
+from capture_scenes import orthographic, perspective, quad, scene, soup, surface
+
+import warpfrag.capture.memory as memory
+from warpfrag.capture.capture import capture
+from warpfrag.capture.render import render
+from warpfrag.composite import composite
+from warpfrag.scene.primitives import sphere
+
+
+def crowd(size=(40, 36), **options):
+    """Return a scene of overlapping translucent triangles."""
+    return scene(perspective(size), soup(1, 30), soup(2, 30, name="more"), **{"beta": 0.4, **options})
+
+
+def test_two_planes_by_hand():
+    """Two half-transparent planes over a background composite as over says."""
+    setting = scene(
+        perspective((3, 2)),
+        quad(2.0, name="far", color=(0.0, 1.0, 0.0), opacity=0.5, thickness=0.0),
+        quad(1.0, name="near", color=(1.0, 0.0, 0.0), opacity=0.5, thickness=0.0),
+        background=(0.0, 0.0, 0.8, 0.8),
+    )
+    np.testing.assert_allclose(render(setting), np.tile([0.5, 0.25, 0.2, 0.95], (2, 3, 1)), rtol=1e-6)
+    np.testing.assert_allclose(render(setting, background=False), np.tile([0.5, 0.25, 0, 0.75], (2, 3, 1)), rtol=1e-6)
+
+
+def test_options_come_from_the_scene_then_parameters_then_keywords():
+    """The scene's beta, layers, merge and mix hold; parameters override beta, keywords everything."""
+    setting = crowd(layers=2, merge="order_independent", mix="average")
+    fragments = capture(setting)
+
+    def expected(**changed):
+        options = {"beta": 0.4, "max_layers": 2, "merge": "order_independent", "mix": "average", **changed}
+        return composite(fragments, **options)
+
+    np.testing.assert_array_equal(render(setting), expected())
+    smooth = {"max_layers": 3, "merge": "smooth", "mix": "opacity"}
+    np.testing.assert_array_equal(render(setting, **smooth), expected(**smooth))
+    np.testing.assert_array_equal(render(setting, parameters={"beta": 0.9}, **smooth), expected(beta=0.9, **smooth))
+    both = render(setting, parameters={"beta": 0.9}, beta=0.1, **smooth)
+    np.testing.assert_array_equal(both, expected(beta=0.1, **smooth))
+    assert (expected(beta=0.1, **smooth) != expected(beta=0.9, **smooth)).any()
+
+
+def test_kind_and_precision_follow_parameters_and_beta():
+    """Any tensor makes the image a tensor; any float64 array makes it float64."""
+    setting = crowd()
+    own = render(setting)
+    assert own.dtype == np.float32
+    for values in ({"parameters": {"soup.opacity": torch.tensor(0.5)}}, {"beta": torch.tensor(0.4)}):
+        image = render(setting, **values)
+        assert isinstance(image, torch.Tensor)
+        assert image.dtype == torch.float32
+    np.testing.assert_array_equal(image.numpy(), own)
+    assert render(setting, beta=np.full((36, 40), 0.4)).dtype == np.float64
+    mixed = {"soup.opacity": torch.tensor(0.5, dtype=torch.float64), "beta": torch.tensor(0.5)}
+    assert render(setting, parameters=mixed).dtype == torch.float64
+
+
+def test_image_is_differentiable_in_all_scene_parameters():
+    """The gradient of pixels away from edges equals central differences, beta included."""
+    setting = scene(
+        perspective((6, 6)),
+        quad(2.0, 1.5, name="front", color=(0.9, 0.2, 0.1), opacity=0.4, thickness=0.6),
+        surface([[-2, -2, 1.9], [2, -2, 2.4], [0.1, 3, 2.2]], [[0, 1, 2]], "tilted", color=(0.1, 0.8, 0.3), opacity=0.7,
+                thickness=[0.3, 0.5, 0.4]),
+        background=(0.1, 0.2, 0.3, 1.0),
+    )  # fmt: skip
+    names = [f"{item}.{key}" for item in ("front", "tilted") for key in ("vertices", "color", "opacity", "thickness")]
+    values = setting.parameters()
+    leaves = [torch.tensor(values[name], dtype=torch.float64, requires_grad=True) for name in names]
+    beta = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
+
+    def image(beta, *tensors):
+        return render(setting, parameters={**dict(zip(names, tensors, strict=True)), "beta": beta})
+
+    assert torch.autograd.gradcheck(image, (beta, *leaves), eps=1e-6, atol=1e-6, rtol=1e-4)
+    for grad in torch.autograd.grad(image(beta, *leaves).square().sum(), [beta, *leaves]):
+        assert grad.any()
+
+
+def limits(setting, parameters=None) -> list[float]:
+    """Return memory limits under which an image falls into a few bands."""
+    fragments = capture(setting, parameters=parameters)
+    size = 2 if fragments.kind == "torch" else 1
+    fixed = memory.STRIP_BYTES * 70 + 5000 if size == 2 else 60 * 28
+    return [fixed + fragments.count * 36 * size / part for part in (1.5, 3, 6)]
+
+
+def test_bands_have_the_same_pixels(monkeypatch):
+    """An image rendered in bands of rows equals the whole one to the bit, with beta and thickness maps per pixel."""
+    random = np.random.default_rng(0)
+    setting = scene(perspective((40, 36)), soup(1, 30), soup(2, 30, name="more"),
+                    quad(2.2, name="map", opacity=0.5, thickness=random.uniform(0, 1, (36, 40))))  # fmt: skip
+    beta = random.uniform(0, 1, (36, 40)).astype(np.float32)
+    bands = []
+    monkeypatch.setattr(
+        "warpfrag.capture.render.split_rows", lambda *a: bands.append(memory.split_rows(*a)) or bands[-1]
+    )
+    whole = render(setting, beta=beta)
+    assert not bands
+    for limit in limits(setting):
+        np.testing.assert_array_equal(render(setting, beta=beta, memory_limit=limit), whole)
+    assert [len(found) for found in bands] == sorted(len(found) for found in bands)
+    assert len(bands) == 3
+    assert len(bands[-1]) > 3
+
+
+def test_bands_have_the_same_gradients():
+    """The gradient of an image in bands equals that of the whole up to the order of sums."""
+    setting = crowd()
+    names = ["soup.vertices", "more.color", "soup.opacity", "beta"]
+
+    def run(limit):
+        values = {n: torch.tensor(setting.parameters()[n], dtype=torch.float32, requires_grad=True) for n in names}
+        image = render(setting, parameters=values, memory_limit=limit)
+        return image, torch.autograd.grad(image.square().sum(), list(values.values()))
+
+    image, grads = run(None)
+    limit = limits(setting, {"beta": torch.tensor(0.4)})[2]
+    banded, banded_grads = run(limit)
+    assert torch.equal(image, banded)
+    for one, other in zip(grads, banded_grads, strict=True):
+        # Single precision sums over some thousand fragments.
+        torch.testing.assert_close(other, one, rtol=1e-3, atol=1e-3 * float(one.abs().max()))
+
+
+def test_split_rows_takes_as_few_bands_as_fit():
+    """Rows are packed from the top; a row that does not fit is an error with both numbers."""
+    counts = np.array([1, 1, 2, 0, 3, 1])
+    assert memory.split_rows(counts, 0.0, 10, 40.0) == [(0, 4), (4, 6)]
+    assert memory.split_rows(counts, 0.0, 10, 80.0) == [(0, 6)]
+    assert memory.split_rows(counts, 0.0, 10, 30.0) == [(0, 2), (2, 4), (4, 5), (5, 6)]
+    with pytest.raises(MemoryError, match=r"row 4 with its 3 fragments would take 30 B, expected at most 29 B"):
+        memory.split_rows(counts, 0.0, 10, 29.0)
+
+
+def test_memory_is_refused_with_both_numbers():
+    """A capture, a row, or the triangles alone beyond the limit are refused before anything is stored."""
+    setting = scene(perspective((64, 64)), quad(2.0), quad(3.0, name="other"))
+    with pytest.raises(MemoryError, match=r"8192 fragments would take 288\.\d KiB, expected at most 97\.66 KiB"):
+        capture(setting, memory_limit=100_000)
+    assert capture(setting, memory_limit=300_000).count == 8192
+    with pytest.raises(MemoryError, match=r"row 0 with its 128 fragments would take 4\.5 KiB, expected at most 3"):
+        render(setting, memory_limit=4_000)
+    with pytest.raises(MemoryError, match=r"4 triangles would take 112 B, expected at most 50 B"):
+        render(setting, memory_limit=50)
+
+
+def test_gradients_are_counted_in_the_prediction():
+    """With gradients a fragment takes more memory."""
+    setting = scene(perspective((64, 64)), quad(2.0), quad(3.0, name="other"))
+    values = {"quad.opacity": torch.tensor(0.5, requires_grad=True)}
+    with pytest.raises(MemoryError, match=r"8192 fragments would take 481 KiB"):
+        capture(setting, parameters=values, memory_limit=300_000)
+    assert capture(setting, parameters=values, memory_limit=600_000).count == 8192
+
+
+def test_default_limit_is_half_of_the_free_memory(monkeypatch):
+    """Without a limit, half of what the system says is free; all where it says nothing."""
+    import warp as wp
+
+    cpu = wp.get_device("cpu")
+    assert memory.free_memory(cpu) > 2**20
+    monkeypatch.setattr(memory, "free_memory", lambda device: 1000)
+    assert memory.allowed_memory(None, cpu) == 500
+    with pytest.raises(MemoryError, match="expected at most 500 B"):
+        capture(scene(perspective((64, 64)), quad(2.0)))
+    monkeypatch.setattr(memory, "free_memory", lambda device: None)
+    assert memory.allowed_memory(None, cpu) == float("inf")
+
+
+@pytest.mark.parametrize("objects", [[], [quad(-2.0)]], ids=["none", "behind"])
+def test_nothing_to_see_is_the_background(objects):
+    """A scene without anything in view shows its background, and is differentiable."""
+    setting = scene(perspective((5, 4)), *objects, background=(0.1, 0.2, 0.3, 0.5))
+    np.testing.assert_array_equal(render(setting), np.tile(np.float32([0.1, 0.2, 0.3, 0.5]), (4, 5, 1)))
+    beta = torch.tensor(0.5, requires_grad=True)
+    image = render(setting, parameters={"beta": beta})
+    (grad,) = torch.autograd.grad(image.sum(), beta)
+    assert grad == 0
+
+
+@pytest.mark.parametrize("threads", [2, 3, 8])
+def test_bits_do_not_depend_on_threads(threads, monkeypatch):
+    """Images and their gradients have the same bits for any number of threads."""
+    mesh = sphere(0.8, 40)
+    setting = scene(
+        orthographic((64, 60), 3.0), soup(1, 40), surface(mesh.vertices + np.array([0, 0, 2.5]), mesh.faces, "ball")
+    )
+    names = ["soup.vertices", "ball.opacity", "ball.thickness", "beta"]
+
+    def run(count):
+        monkeypatch.setenv("WARPFRAG_THREADS", str(count))
+        values = {n: torch.tensor(setting.parameters()[n], dtype=torch.float32, requires_grad=True) for n in names}
+        image = render(setting, parameters=values)
+        return [image, *torch.autograd.grad(image.square().sum(), list(values.values()))]
+
+    for one, other in zip(run(1), run(threads), strict=True):
+        assert torch.equal(one, other)
+
+
+def test_arguments_are_checked():
+    """Wrong arguments are named."""
+    setting = crowd()
+    with pytest.raises(TypeError, match="scene: got dict"):
+        render({})
+    with pytest.raises(ValueError, match="merge: got 'simple'"):
+        render(setting, merge="simple")
+    with pytest.raises(ValueError, match="max_layers: got 0"):
+        render(setting, max_layers=0)
+    with pytest.raises(ValueError, match="beta: got 2"):
+        render(setting, beta=2.0)
+    with pytest.raises(ValueError, match="beta: got shape"):
+        render(setting, beta=np.zeros((3, 3)))
+    with pytest.raises(ValueError, match="unknown name"):
+        render(setting, parameters={"soup.thicknes": 1.0})
