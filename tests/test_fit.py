@@ -15,6 +15,8 @@ from warpfrag.fit.jacobian import Evaluation
 from warpfrag.fit.losses import RobustLoss
 from warpfrag.fit.problem import FrozenGeometry, Problem
 from warpfrag.images import read_image, write_image
+from warpfrag.scene.objects import SceneObject
+from warpfrag.scene.primitives import plane
 
 STARTS = {"beta": 0.9, "red.thickness": 0.8, "green.thickness": 0.12, "blue.thickness": 0.6}
 EVERYTHING = {"beta": 0.4, "red.thickness": 0.5, "green.opacity": 0.7, "blue.color": [0.3, 0.4, 0.5]}
@@ -161,13 +163,24 @@ def test_parameters_out_of_sight_are_named():
 
 def test_color_and_opacity_need_the_opacity_channel():
     """On black and without an opacity channel only their product counts: both are named."""
-    scene = replace(spheres(1), background=(0.0, 0.0, 0.0, 1.0))
-    study = make_study({"red.opacity": 0.5, "red.color": [0.9, 0.1, 0.1]}, scene=scene)
-    # A single closed sphere shows the product and, where two walls overlap, its square; a disc would not.
-    flat = replace(scene, objects=[replace(scene.objects[0], faces=scene.objects[0].faces[:1])])
-    image = Problem(replace(study, scene=flat)).reference[..., :3]
-    result = fit(replace(study, scene=flat, reference=Reference(image=image)))
-    assert "red.opacity" in result.undetermined
+    mesh = plane()
+    flat = SceneObject("flat", mesh.vertices, mesh.faces, color=(0.9, 0.2, 0.5), opacity=0.6)
+    scene = replace(spheres(0), objects=[flat], background=(0.0, 0.0, 0.0, 1.0))
+    starts = {"flat.opacity": 0.5, "flat.color": [0.9, 0.1, 0.1]}
+    result = fit(Study(scene, Reference(image=render(scene)[..., :3]), starts))
+    assert result.undetermined == ("flat.opacity", "flat.color[0]", "flat.color[1]", "flat.color[2]")
+    clear = replace(scene, background=(0.0, 0.0, 0.0, 0.0))
+    assert fit(make_study(starts, scene=clear)).undetermined == ()
+
+
+def test_an_empty_view_determines_nothing():
+    """Where no object is seen every parameter is named, and the fit ends."""
+    scene = spheres(1)
+    scene.objects[0].matrix[2, 3] = 100.0
+    for method in ("least_squares", "adam", "lbfgs"):
+        result = fit(make_study({"beta": 0.3, "red.thickness": 0.1}, scene=scene, method=method, steps=5))
+        assert result.undetermined == ("beta", "red.thickness")
+        assert result.found["red.thickness"] == pytest.approx(0.1)
 
 
 @pytest.mark.parametrize("method", ["adam", "lbfgs"])

@@ -145,7 +145,7 @@ _COMPOSITE_LAYERS = Operator(
 
 
 @cache
-def _fragments_forward_kernel(scalar: Any) -> wp.Kernel:
+def _fragments_forward_kernel(scalar: Any, merge_kind: int, mix: int) -> wp.Kernel:
     vec3 = wp.types.vector(3, scalar)
     vec4 = wp.types.vector(4, scalar)
 
@@ -175,18 +175,18 @@ def _fragments_forward_kernel(scalar: Any) -> wp.Kernel:
                 fragment = order[base + position]
                 if not valid_fragment(pixels, fragment):
                     wp.atomic_min(invalid, span.worker, 0, fragment)
-                following = load_slab(pixels, fragment)
+                following = load_slab(pixels, fragment, merge_kind)
                 step = int(STEP_START)
                 if position > 0:
-                    step = choose_step(pixels, running, following, layer)
+                    step = choose_step(running, following, layer, pixels.max_layers, merge_kind)
                 if step == STEP_START:
                     color += through * running.c
                     through *= running.t
                     layer += wp.where(position > 0, 1, 0)
                     running = following
                 else:
-                    front, back = step_powers(pixels, step, running, following)
-                    running = take_step(pixels, step, running, following, beta, front, back)
+                    front, back = step_powers(step, running, following, merge_kind, pixels.floor)
+                    running = take_step(step, running, following, beta, front, back, merge_kind, mix)
             color += through * running.c
             image[pixel] = vec4(color[0], color[1], color[2], scalar(1.0) - through * running.t)
 
@@ -194,7 +194,7 @@ def _fragments_forward_kernel(scalar: Any) -> wp.Kernel:
 
 
 @cache
-def _fragments_backward_kernel(scalar: Any) -> wp.Kernel:
+def _fragments_backward_kernel(scalar: Any, merge_kind: int, mix: int) -> wp.Kernel:
     vec3 = wp.types.vector(3, scalar)
     vec4 = wp.types.vector(4, scalar)
 
@@ -210,7 +210,7 @@ def _fragments_backward_kernel(scalar: Any) -> wp.Kernel:
         for pixel in range(span.begin + wp.tid(), span.end, span.stride):
             count = pixels.offsets[pixel + 1] - pixels.offsets[pixel]
             beta = pixel_beta(pixels, pixel)
-            replay(pixels, pixel, scratch, base)
+            replay(pixels, pixel, merge_kind, mix, scratch, base)
             g_color = vec3(grad_image[pixel][0], grad_image[pixel][1], grad_image[pixel][2])
             g_opacity = grad_image[pixel][3]
             behind = vec3()
@@ -233,7 +233,6 @@ def _fragments_backward_kernel(scalar: Any) -> wp.Kernel:
                 g_fragment = g
                 if step != STEP_START:
                     g_running, g_following, g_step = take_step_adjoint(
-                        pixels,
                         step,
                         g,
                         scratch.running[at - 1],
@@ -241,6 +240,9 @@ def _fragments_backward_kernel(scalar: Any) -> wp.Kernel:
                         beta,
                         scratch.front[at],
                         scratch.back[at],
+                        merge_kind,
+                        mix,
+                        pixels.floor,
                     )
                     g = g_running
                     g_fragment = g_following
@@ -252,6 +254,91 @@ def _fragments_backward_kernel(scalar: Any) -> wp.Kernel:
     return composite_fragments_bwd
 
 
+@cache
+def _over_forward_kernel(scalar: Any, merge_kind: int, mix: int) -> wp.Kernel:
+    """Return the kernel for fragments that do not merge: over is associative, so layers and tail make no difference."""
+    vec3 = wp.types.vector(3, scalar)
+    vec4 = wp.types.vector(4, scalar)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def composite_over_fwd(
+        span: Span,
+        pixels: PIXELS[scalar],
+        order: wp.array(dtype=int),
+        length: int,
+        invalid: wp.array2d(dtype=int),
+        image: wp.array(dtype=vec4),
+    ):
+        base = (span.worker + wp.tid()) * length
+        for pixel in range(span.begin + wp.tid(), span.end, span.stride):
+            begin = pixels.offsets[pixel]
+            count = pixels.offsets[pixel + 1] - begin
+            if not valid_beta(pixels, pixel):
+                wp.atomic_min(invalid, span.worker, 1, pixel)
+            sort_pixel(pixels, begin, count, order, base)
+            color = vec3()
+            through = scalar(1.0)
+            for position in range(count):
+                fragment = order[base + position]
+                if not valid_fragment(pixels, fragment):
+                    wp.atomic_min(invalid, span.worker, 0, fragment)
+                rgba = pixels.rgba[fragment]
+                color += through * vec3(rgba[0], rgba[1], rgba[2])
+                through *= scalar(1.0) - rgba[3]
+            image[pixel] = vec4(color[0], color[1], color[2], scalar(1.0) - through)
+
+    return composite_over_fwd
+
+
+@cache
+def _over_backward_kernel(scalar: Any, merge_kind: int, mix: int) -> wp.Kernel:
+    vec3 = wp.types.vector(3, scalar)
+    vec4 = wp.types.vector(4, scalar)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def composite_over_bwd(
+        span: Span,
+        pixels: PIXELS[scalar],
+        scratch: SCRATCH[scalar],
+        grad_image: wp.array(dtype=vec4),
+        grads: GRADIENTS[scalar],
+    ):
+        base = (span.worker + wp.tid()) * scratch.length
+        for pixel in range(span.begin + wp.tid(), span.end, span.stride):
+            begin = pixels.offsets[pixel]
+            count = pixels.offsets[pixel + 1] - begin
+            sort_pixel(pixels, begin, count, scratch.order, base)
+            through = scalar(1.0)
+            for position in range(count):
+                scratch.through[base + position] = through
+                through *= scalar(1.0) - pixels.rgba[scratch.order[base + position]][3]
+            g = grad_image[pixel]
+            g_color = vec3(g[0], g[1], g[2])
+            behind = vec3()
+            through_behind = scalar(1.0)
+            for back in range(count):
+                at = base + count - 1 - back
+                fragment = scratch.order[at]
+                rgba = pixels.rgba[fragment]
+                t = scratch.through[at]
+                if grads.rgba.shape[0] > 0:
+                    g_opacity = t * (g[3] * through_behind - wp.dot(g_color, behind))
+                    grads.rgba[fragment] = vec4(t * g[0], t * g[1], t * g[2], g_opacity)
+                behind = vec3(rgba[0], rgba[1], rgba[2]) + (scalar(1.0) - rgba[3]) * behind
+                through_behind *= scalar(1.0) - rgba[3]
+                # Nothing else plays a part in over.
+                if grads.depth.shape[0] > 0:
+                    grads.depth[fragment] = scalar(0.0)
+                if grads.thickness.shape[0] > 0:
+                    grads.thickness[fragment] = scalar(0.0)
+                if grads.opacity_sum.shape[0] > 0:
+                    grads.opacity_sum[fragment] = scalar(0.0)
+            if grads.beta.shape[0] > 0:
+                grads.beta[pixel] = scalar(0.0)
+
+    return composite_over_bwd
+
+
 def _fragments_output_like(
     inputs: Sequence[Any], max_layers: int, merge: str, mix: str
 ) -> list[tuple[tuple[int, ...], str]]:
@@ -259,15 +346,15 @@ def _fragments_output_like(
 
 
 def _fragments_forward(inputs: Sequence[Any], outputs: Sequence[Any], **options: Any) -> None:
-    walk = Walk(inputs, **options)
-    walk.forward(_fragments_forward_kernel(walk.scalar), [vectors(outputs[0])])
+    kernel = _over_forward_kernel if options["merge"] == "none" else _fragments_forward_kernel
+    Walk(inputs, **options).forward(kernel, [vectors(outputs[0])])
 
 
 def _fragments_backward(
     inputs: Sequence[Any], grad_outputs: Sequence[Any], grad_inputs: Sequence[Any], **options: Any
 ) -> None:
-    walk = Walk(inputs, **options)
-    walk.backward(_fragments_backward_kernel(walk.scalar), [vectors(grad_outputs[0])], grad_inputs)
+    kernel = _over_backward_kernel if options["merge"] == "none" else _fragments_backward_kernel
+    Walk(inputs, **options).backward(kernel, [vectors(grad_outputs[0])], grad_inputs)
 
 
 _COMPOSITE_FRAGMENTS = Operator(
@@ -318,7 +405,7 @@ def composite(
         rgba = source.rgba.reshape((pixel_count, source.max_layers, 4))
         (image,) = apply(_COMPOSITE_LAYERS, (rgba, as_int32(source.count).reshape((pixel_count,))))
         return image.reshape((*source.shape, 4))
-    defaults = {"beta": 1.0, "max_layers": 8, "merge": "smooth", "mix": "opacity"}
+    defaults: dict[str, Any] = {"beta": 1.0, "max_layers": 8, "merge": "smooth", "mix": "opacity"}
     chosen = {name: default if given[name] is None else given[name] for name, default in defaults.items()}
     inputs = fragment_inputs(source, chosen.pop("beta"))
     check_options(**chosen)

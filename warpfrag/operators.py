@@ -1,7 +1,7 @@
 """The formulas: slabs, how two of them become one, and the adjoints of that.
 
-A slab is a fragment with its z-thickness: premultiplied colour `c`, opacity `a`, transmittance `t = 1 - a`, logarithm of
-it `l`, weight `w = S/A` (the opacity sum per opacity: 1 for a fresh fragment), front depth `f`, back depth `z`.
+A slab is a fragment with its z-thickness: premultiplied colour `c`, opacity `a`, transmittance `t = 1 - a`, logarithm
+of it `l`, weight `w = S/A` (the opacity sum per opacity: 1 for a fresh fragment), front depth `f`, back depth `z`.
 Transmittance multiplies and its logarithm adds however slabs are merged, so both are carried along and never computed
 from a rounded opacity: that keeps opaque slabs exact and costs one logarithm per fragment.
 
@@ -14,8 +14,8 @@ rest of a (x) mixed with as much of b (y); the rest of b (v). Order-independent 
 a piece's part of the slab has opacity gain / D, and over multiplies by D again: the merged colour is
 (1 - x + mixed_a) C_a + (1 - y - v + mixed_b + T_a v) C_b, a sum of positive terms in which no D divides.
 
-An adjoint `..._adjoint(g, ...)` returns the vector-Jacobian product of its operator with the cotangent g. It treats a, t
-and l as independent: their sum is the derivative in opacity. All functions are generic over `Slab32` and `Slab64`.
+An adjoint `..._adjoint(g, ...)` returns the vector-Jacobian product of its operator with the cotangent g. It treats a,
+t and l as independent: their sum is the derivative in opacity. All functions are generic over `Slab32` and `Slab64`.
 Equation numbers are those of the fragment-merging paper.
 """
 
@@ -67,6 +67,7 @@ class Slab64:
 
 @wp.func(inline=True)
 def slab(c: wp.vec3f, a: float, t: float, l: float, w: float, f: float, z: float) -> Slab32:  # noqa: E741
+    """Return the slab of these components."""
     s = Slab32()
     s.c = c
     s.a = a
@@ -78,7 +79,7 @@ def slab(c: wp.vec3f, a: float, t: float, l: float, w: float, f: float, z: float
     return s
 
 
-@wp.func(inline=True)
+@wp.func(inline=True)  # type: ignore[no-redef]
 def slab(  # noqa: F811
     c: wp.vec3d,
     a: wp.float64,
@@ -88,6 +89,7 @@ def slab(  # noqa: F811
     f: wp.float64,
     z: wp.float64,
 ) -> Slab64:
+    """Return the slab of these components, in double precision."""
     s = Slab64()
     s.c = c
     s.a = a
@@ -181,15 +183,14 @@ def over(a: Any, b: Any):
 
 @wp.func(inline=True)
 def over_adjoint(g: Any, a: Any, b: Any):
+    """Return the gradients in a and b of <g, over(a, b)>."""
     opacity = a.a + a.t * b.a
     weight = divide(a.a * a.w + b.a * b.w, opacity, type(opacity)(1.0))
     g_sum = divide(g.w, opacity, type(opacity)(0.0))
     g_opacity = g.a - g_sum * weight
     g_t = wp.dot(g.c, b.c) + g_opacity * b.a + g.t * b.t
     g_a = slab(g.c, g_opacity + g_sum * a.w, g_t, g.l, g_sum * a.a, g.f, type(opacity)(0.0))
-    g_b = slab(
-        a.t * g.c, g_opacity * a.t + g_sum * b.w, g.t * a.t, g.l, g_sum * b.a, type(opacity)(0.0), g.z
-    )
+    g_b = slab(a.t * g.c, g_opacity * a.t + g_sum * b.w, g.t * a.t, g.l, g_sum * b.a, type(opacity)(0.0), g.z)
     return g_a, g_b
 
 
@@ -211,8 +212,8 @@ def relative_lengths(a: Any, b: Any):
 def sfm_powers(a: Any, b: Any, floor: Any):
     """Return what the optical model (eq. 2) lets through up to the two cuts of overlapping slabs, a.z <= b.z.
 
-    The front cut lies in the slab that begins first, where the other begins; the back cut in b, where a ends. Apart from
-    the operators because exponentials are dear: the way back reuses them.
+    The front cut lies in the slab that begins first, where the other begins; the back cut in b, where a ends. Apart
+    from the operators because exponentials are dear: the way back reuses them.
     """
     a0, a1, b0, b1, b2 = relative_lengths(a, b)
     # a0 or b0 is zero: one exponential serves both.
@@ -242,7 +243,11 @@ def optical_gain_adjoint(g: Any, a: Any, l: Any, r: Any, power: Any, floor: Any)
         return zero, zero, zero
     g_power = -g / a
     g_exponent = g_power * power
-    return g_power * (type(g)(1.0) - power) / a, wp.where(l > floor, g_exponent * r, zero), g_exponent * wp.max(l, floor)
+    return (
+        g_power * (type(g)(1.0) - power) / a,
+        wp.where(l > floor, g_exponent * r, zero),
+        g_exponent * wp.max(l, floor),
+    )
 
 
 @wp.func(inline=True)
@@ -260,7 +265,7 @@ def optical_gains(a: Any, b: Any, front: Any, back: Any):
 
 @wp.func(inline=True)
 def mix_weights(a: Any, b: Any, x: Any, y: Any, d_a: Any, d_1: Any, d_2: Any, mix: int):
-    """Return the weights of the parts' colours in a mix, and whether opaque parts fixed them (then they add up to 1)."""
+    """Return the weights of the two colours of a mix, and whether opaque parts fixed them (then they add up to 1)."""
     zero = type(x)(0.0)
     one = type(x)(1.0)
     half = type(x)(0.5)
@@ -417,6 +422,7 @@ def ofm(a: Any, b: Any, mix: int):
 
 @wp.func(inline=True)
 def ofm_adjoint(g: Any, a: Any, b: Any, mix: int):
+    """Return the gradients in a and b of <g, ofm(a, b)>."""
     g_a, g_b, g_x, g_y, g_v = merge_adjoint(g, a, b, type(a.a)(1.0), type(a.a)(1.0), type(a.a)(0.0), mix)
     return g_a, g_b
 

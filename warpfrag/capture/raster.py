@@ -25,6 +25,7 @@ from warpfrag.capture.ray import (
     is_wide,
     load_point,
     stretch,
+    vectors,
 )
 from warpfrag.interop.launch import Span, launch
 
@@ -62,16 +63,17 @@ def _prepare_kernel(scalar: Any) -> wp.Kernel:
     @wp.kernel(module="unique", enable_backward=False)
     def prepare(
         span: Span,
-        points: wp.array2d(dtype=scalar),
-        faces: wp.array2d(dtype=int),
+        points: wp.array(dtype=wp.types.vector(3, scalar)),
+        faces: wp.array(dtype=wp.vec3i),
         rays: Rays,
-        corners: wp.array2d(dtype=int),
-        boxes: wp.array2d(dtype=int),
+        corners: wp.array(dtype=wp.vec3i),
+        boxes: wp.array(dtype=wp.vec4i),
     ):
         for face in range(span.begin + wp.tid(), span.end, span.stride):
-            i = faces[face, 0]
-            j = faces[face, 1]
-            k = faces[face, 2]
+            given = faces[face]
+            i = given[0]
+            j = given[1]
+            k = given[2]
             if before(load_point(points, j), load_point(points, i)):
                 swapped = i
                 i = j
@@ -84,12 +86,8 @@ def _prepare_kernel(scalar: Any) -> wp.Kernel:
                 swapped = j
                 j = k
                 k = swapped
-            corners[face, 0] = i
-            corners[face, 1] = j
-            corners[face, 2] = k
-            box = bounds(rays, load_point(points, i), load_point(points, j), load_point(points, k))
-            for side in range(4):
-                boxes[face, side] = box[side]
+            corners[face] = wp.vec3i(i, j, k)
+            boxes[face] = bounds(rays, load_point(points, i), load_point(points, j), load_point(points, k))
 
     return prepare
 
@@ -105,7 +103,7 @@ def prepare_triangles(points: wp.array, faces: wp.array, window: Window) -> Tria
     device = points.device
     corners = wp.empty(faces.shape, dtype=int, device=device)
     boxes = wp.empty((faces.shape[0], 4), dtype=int, device=device)
-    inputs = [points, faces, window.rays(), corners, boxes]
+    inputs = [vectors(points), vectors(faces), window.rays(), vectors(corners), vectors(boxes)]
     launch(_prepare_kernel(points.dtype), faces.shape[0], inputs, device)
     listed = None
     if device.is_cpu:
@@ -121,9 +119,9 @@ def _rasterize_kernel(scalar: Any) -> wp.Kernel:
     def rasterize(
         span: Span,
         span_is_pixels: int,
-        points: wp.array2d(dtype=scalar),
-        corners: wp.array2d(dtype=int),
-        boxes: wp.array2d(dtype=int),
+        points: wp.array(dtype=wp.types.vector(3, scalar)),
+        corners: wp.array(dtype=wp.vec3i),
+        boxes: wp.array(dtype=wp.vec4i),
         listed: wp.array(dtype=int),
         rays: Rays,
         slots: wp.array(dtype=int),
@@ -147,14 +145,16 @@ def _rasterize_kernel(scalar: Any) -> wp.Kernel:
             face = item
             if span_is_pixels != 0:
                 face = listed[item]
-            top = wp.max(boxes[face, 0], first_row)
-            bottom = wp.min(boxes[face, 1], end_row)
+            box = boxes[face]
+            top = wp.max(box[0], first_row)
+            bottom = wp.min(box[1], end_row)
             if top < bottom:
-                left = boxes[face, 2]
-                right = boxes[face, 3]
-                a = load_point(points, corners[face, 0])
-                b = load_point(points, corners[face, 1])
-                c = load_point(points, corners[face, 2])
+                left = box[2]
+                right = box[3]
+                corner = corners[face]
+                a = load_point(points, corner[0])
+                b = load_point(points, corner[1])
+                c = load_point(points, corner[2])
                 wide = is_wide(rays, a, b, c, left, right)
                 for row in range(top, bottom):
                     y = centre_y(rays, row)
@@ -184,7 +184,7 @@ def _rasterize(triangles: Triangles, slots: wp.array, fragment_face: wp.array, f
     if by_pixels and listed.shape[0] == 0:
         return
     inputs = [
-        *(int(by_pixels), triangles.points, triangles.corners, triangles.boxes),
+        *(int(by_pixels), vectors(triangles.points), vectors(triangles.corners), vectors(triangles.boxes)),
         *(listed if by_pixels else _nothing(int, triangles.device), triangles.window.rays()),
         *(slots, fragment_face, fragment_depth),
     ]

@@ -96,10 +96,20 @@ class Window:
         return rays
 
 
+def vectors(array: wp.array) -> wp.array:
+    """Return a Warp array of shape (n, k) as an array of n vectors, which kernels load at once; shares its memory."""
+    size, length = array.shape
+    dtype = wp.types.vector(length, array.dtype)
+    view = wp.array(ptr=array.ptr, dtype=dtype, shape=(size,), device=array.device, capacity=array.capacity)
+    # A view by address does not keep its memory alive by itself.
+    view._ref = array
+    return view
+
+
 @wp.func
 def load_point(points: Any, vertex: int) -> wp.vec3d:
     """Return a corner in camera space."""
-    return wp.vec3d(wp.float64(points[vertex, 0]), wp.float64(points[vertex, 1]), wp.float64(points[vertex, 2]))
+    return wp.vec3d(points[vertex])
 
 
 @wp.func
@@ -170,8 +180,8 @@ def side(e: wp.float64, a: wp.vec2d, b: wp.vec2d, a_w: wp.float64, b_w: wp.float
 @wp.func
 def planar_depth(e: wp.vec3d, a: wp.float64, b: wp.float64, c: wp.float64) -> wp.float64:
     """Interpolate the corners' planar depths; exact where all three are equal."""
-    total = e[0] + e[1] + e[2]
-    return a + e[1] / total * (b - a) + e[2] / total * (c - a)
+    scale = ONE / (e[0] + e[1] + e[2])
+    return a + e[1] * scale * (b - a) + e[2] * scale * (c - a)
 
 
 @wp.func

@@ -29,6 +29,7 @@ from warpfrag.capture.ray import (
     planar_depth,
     seen_from,
     stretch,
+    vectors,
 )
 from warpfrag.capture.texture import load_rgba, load_uv, look_up, mix3, texel_between
 from warpfrag.interop.launch import Span, launch
@@ -44,6 +45,7 @@ SHADE_TENSORS = (
     *("points", "rgba", "thickness", "maps", "corners", "fragment_face", "offsets", "object_id", "objects"),
     *("uv", "texture_id", "texels", "textures"),
 )
+_VECTORS = ("points", "rgba", "corners", "objects", "uv", "texels", "textures")
 SHADE_DIFFERENTIABLE = ("points", "rgba", "thickness", "maps")
 SHADE_OUTPUTS = ("rgba", "depth", "thickness", "object_id", "primitive_id")
 SHADE_OPTIONS = {
@@ -62,8 +64,8 @@ def hit_weights(
         seen_from(b, x, y, scale, perspective),
         seen_from(c, x, y, scale, perspective),
     )
-    total = e[0] + e[1] + e[2]
-    return wp.vec3d(e[1] / total, e[2] / total, planar_depth(e, a[2], b[2], c[2]))
+    scale = ONE / (e[0] + e[1] + e[2])
+    return wp.vec3d(e[1] * scale, e[2] * scale, planar_depth(e, a[2], b[2], c[2]))
 
 
 @wp.func
@@ -83,24 +85,26 @@ def thickness_scale(depth: wp.float64, in_p: int, near: wp.float64, far: wp.floa
 
 @cache
 def _forward_kernel(scalar: Any) -> wp.Kernel:
+    vec3, vec4 = wp.types.vector(3, scalar), wp.types.vector(4, scalar)
+
     @wp.kernel(module="unique", enable_backward=False)
     def shade_fwd(
         span: Span,
         rays: Rays,
-        points: wp.array2d(dtype=scalar),
-        rgba: wp.array2d(dtype=scalar),
+        points: wp.array(dtype=vec3),
+        rgba: wp.array(dtype=vec4),
         thickness: wp.array(dtype=scalar),
         maps: wp.array2d(dtype=scalar),
-        corners: wp.array2d(dtype=int),
+        corners: wp.array(dtype=wp.vec3i),
         fragment_face: wp.array(dtype=int),
         offsets: wp.array(dtype=int),
         object_id: wp.array(dtype=int),
-        objects: wp.array2d(dtype=int),
-        uv: wp.array2d(dtype=float),
+        objects: wp.array(dtype=wp.vec3i),
+        uv: wp.array(dtype=wp.vec2f),
         texture_id: wp.array(dtype=int),
-        texels: wp.array2d(dtype=float),
-        textures: wp.array2d(dtype=int),
-        fragment_rgba: wp.array2d(dtype=scalar),
+        texels: wp.array(dtype=wp.vec4f),
+        textures: wp.array(dtype=wp.vec3i),
+        fragment_rgba: wp.array(dtype=vec4),
         fragment_depth: wp.array(dtype=scalar),
         fragment_thickness: wp.array(dtype=scalar),
         fragment_object: wp.array(dtype=int),
@@ -114,9 +118,10 @@ def _forward_kernel(scalar: Any) -> wp.Kernel:
             along = stretch(x, y, rays.scale, rays.perspective)
             for fragment in range(offsets[pixel], offsets[pixel + 1]):
                 face = fragment_face[fragment]
-                i = corners[face, 0]
-                j = corners[face, 1]
-                k = corners[face, 2]
+                corner = corners[face]
+                i = corner[0]
+                j = corner[1]
+                k = corner[2]
                 hit = hit_weights(
                     load_point(points, i), load_point(points, j), load_point(points, k),
                     x, y, rays.scale, rays.perspective,
@@ -132,18 +137,19 @@ def _forward_kernel(scalar: Any) -> wp.Kernel:
                 )
                 depth = hit[2] * along
                 item = object_id[face]
+                object = objects[item]
                 own = mix3(wp.float64(thickness[i]), wp.float64(thickness[j]), wp.float64(thickness[k]), hit[0], hit[1])
-                if objects[item, OBJECT_MAP] >= 0:
-                    own = wp.float64(maps[objects[item, OBJECT_MAP], rays.first_row * rays.width + pixel])
-                own *= thickness_scale(depth, objects[item, OBJECT_IN_P], rays.near, rays.far)
-                for channel in range(3):
-                    fragment_rgba[fragment, channel] = scalar(shaded[channel])
+                if object[OBJECT_MAP] >= 0:
+                    own = wp.float64(maps[object[OBJECT_MAP], rays.first_row * rays.width + pixel])
+                own *= thickness_scale(depth, object[OBJECT_IN_P], rays.near, rays.far)
                 # Rounding may leave an interpolated value just outside its range.
-                fragment_rgba[fragment, 3] = scalar(wp.clamp(shaded[3], ZERO, ONE))
+                fragment_rgba[fragment] = vec4(
+                    wp.vec4d(shaded[0], shaded[1], shaded[2], wp.clamp(shaded[3], ZERO, ONE))
+                )
                 fragment_depth[fragment] = scalar(depth)
                 fragment_thickness[fragment] = scalar(wp.max(own, ZERO))
                 fragment_object[fragment] = item
-                fragment_primitive[fragment] = face - objects[item, OBJECT_FIRST_FACE]
+                fragment_primitive[fragment] = face - object[OBJECT_FIRST_FACE]
 
     return shade_fwd
 
@@ -155,23 +161,23 @@ def shade_output_like(inputs: Sequence[Any], **options: Any) -> list[tuple[tuple
 
 
 def present(inputs: Sequence[wp.array | None]) -> list[wp.array]:
-    """Return the inputs `SHADE_TENSORS` with empty arrays in place of None: kernels skip those."""
+    """Return the inputs `SHADE_TENSORS` as kernels take them, with empty arrays in place of None: those are skipped."""
     points = inputs[0]
-    kinds = {"maps": (2, points.dtype), "uv": (2, wp.float32), "texture_id": (1, wp.int32)}
-    kinds |= {"texels": (2, wp.float32), "textures": (2, wp.int32)}
+    kinds = {"maps": ((0, 0), points.dtype), "uv": ((0, 2), wp.float32), "texture_id": ((0,), wp.int32)}
+    kinds |= {"texels": ((0, 4), wp.float32), "textures": ((0, 3), wp.int32)}
     arrays = []
     for name, array in zip(SHADE_TENSORS, inputs, strict=True):
         if array is None:
-            ndim, dtype = kinds[name]
-            array = wp.empty((0,) * ndim, dtype=dtype, device=points.device)
-        arrays.append(array)
+            shape, dtype = kinds[name]
+            array = wp.empty(shape, dtype=dtype, device=points.device)
+        arrays.append(vectors(array) if name in _VECTORS else array)
     return arrays
 
 
 def shade_forward(inputs: Sequence[wp.array | None], outputs: Sequence[wp.array], **options: Any) -> None:
     """Shade the fragments: `inputs` are `SHADE_TENSORS`, `outputs` `SHADE_OUTPUTS`, `options` those of a `Window`."""
-    arguments = present(inputs)
+    points = inputs[0]
     if outputs[0].shape[0]:
         window = Window(**options)
-        kernel = _forward_kernel(arguments[0].dtype)
-        launch(kernel, window.pixel_count, [window.rays(), *arguments, *outputs], arguments[0].device)
+        arguments = [window.rays(), *present(inputs), vectors(outputs[0]), *outputs[1:]]
+        launch(_forward_kernel(points.dtype), window.pixel_count, arguments, points.device)

@@ -32,6 +32,7 @@ from warpfrag.capture.ray import (
     load_point,
     seen_from,
     stretch,
+    vectors,
 )
 from warpfrag.capture.shade import (
     OBJECT_IN_P,
@@ -121,15 +122,15 @@ def hit_adjoint(
     seen_b = seen_from(b, x, y, rays.scale, rays.perspective)
     seen_c = seen_from(c, x, y, rays.scale, rays.perspective)
     e = edge_functions(seen_a, seen_b, seen_c)
-    total = e[0] + e[1] + e[2]
-    l_b = e[1] / total
-    l_c = e[2] / total
+    inverse = ONE / (e[0] + e[1] + e[2])
+    l_b = e[1] * inverse
+    l_c = e[2] * inverse
     g_b += g_z * (b[2] - a[2])
     g_c += g_z * (c[2] - a[2])
     mean = g_b * l_b + g_c * l_c
-    e_a = -mean / total
-    e_b = (g_b - mean) / total
-    e_c = (g_c - mean) / total
+    e_a = -mean * inverse
+    e_b = (g_b - mean) * inverse
+    e_c = (g_c - mean) * inverse
     to_a = turned(e_c, seen_b) - turned(e_b, seen_c)
     to_b = turned(e_a, seen_c) - turned(e_c, seen_a)
     to_c = turned(e_b, seen_a) - turned(e_a, seen_b)
@@ -155,23 +156,23 @@ def _strip_kernel(scalar: Any) -> wp.Kernel:
     def shade_bwd(
         span: Span,
         rays: Rays,
-        points: wp.array2d(dtype=scalar),
-        rgba: wp.array2d(dtype=scalar),
+        points: wp.array(dtype=wp.types.vector(3, scalar)),
+        rgba: wp.array(dtype=wp.types.vector(4, scalar)),
         thickness: wp.array(dtype=scalar),
         maps: wp.array2d(dtype=scalar),
-        corners: wp.array2d(dtype=int),
+        corners: wp.array(dtype=wp.vec3i),
         fragment_face: wp.array(dtype=int),
         offsets: wp.array(dtype=int),
         object_id: wp.array(dtype=int),
-        objects: wp.array2d(dtype=int),
-        uv: wp.array2d(dtype=float),
+        objects: wp.array(dtype=wp.vec3i),
+        uv: wp.array(dtype=wp.vec2f),
         texture_id: wp.array(dtype=int),
-        texels: wp.array2d(dtype=float),
-        textures: wp.array2d(dtype=int),
-        grad_fragment_rgba: wp.array2d(dtype=scalar),
+        texels: wp.array(dtype=wp.vec4f),
+        textures: wp.array(dtype=wp.vec3i),
+        grad_fragment_rgba: wp.array(dtype=wp.types.vector(4, scalar)),
         grad_fragment_depth: wp.array(dtype=scalar),
         grad_fragment_thickness: wp.array(dtype=scalar),
-        boxes: wp.array2d(dtype=int),
+        boxes: wp.array(dtype=wp.vec4i),
         strip_ends: wp.array(dtype=int),
         grad_points: wp.array2d(dtype=wp.vec3d),
         grad_rgba: wp.array2d(dtype=wp.vec4d),
@@ -182,13 +183,15 @@ def _strip_kernel(scalar: Any) -> wp.Kernel:
             number = strip
             if face > 0:
                 number -= strip_ends[face - 1]
-            left = boxes[face, 2]
-            right = boxes[face, 3]
+            box = boxes[face]
+            left = box[2]
+            right = box[3]
             strip_rows = rows_of_strip(left, right)
-            top = boxes[face, 0] + number * strip_rows
-            i = corners[face, 0]
-            j = corners[face, 1]
-            k = corners[face, 2]
+            top = box[0] + number * strip_rows
+            corner = corners[face]
+            i = corner[0]
+            j = corner[1]
+            k = corner[2]
             a = load_point(points, i)
             b = load_point(points, j)
             c = load_point(points, k)
@@ -199,8 +202,8 @@ def _strip_kernel(scalar: Any) -> wp.Kernel:
             own_b = wp.float64(thickness[j])
             own_c = wp.float64(thickness[k])
             item = object_id[face]
-            map = objects[item, OBJECT_MAP]
-            in_p = objects[item, OBJECT_IN_P]
+            map = objects[item][OBJECT_MAP]
+            in_p = objects[item][OBJECT_IN_P]
             texture = int(-1)
             uv_a = wp.vec2d()
             uv_b = wp.vec2d()
@@ -212,7 +215,7 @@ def _strip_kernel(scalar: Any) -> wp.Kernel:
                 uv_c = load_uv(uv, k)
             sum = Corners()
             wide = is_wide(rays, a, b, c, left, right)
-            for row in range(top, wp.min(top + strip_rows, boxes[face, 1])):
+            for row in range(top, wp.min(top + strip_rows, box[1])):
                 y = centre_y(rays, row)
                 columns = wp.vec2i(left, right)
                 if wide:
@@ -294,18 +297,21 @@ def _strip_kernel(scalar: Any) -> wp.Kernel:
     return shade_bwd
 
 
+_MAPS_TENSORS = ("points", "corners", "fragment_face", "offsets", "object_id", "objects")
+
+
 @cache
 def _maps_kernel(scalar: Any) -> wp.Kernel:
     @wp.kernel(module="unique", enable_backward=False)
     def maps_bwd(
         span: Span,
         rays: Rays,
+        points: wp.array(dtype=wp.types.vector(3, scalar)),
+        corners: wp.array(dtype=wp.vec3i),
         fragment_face: wp.array(dtype=int),
         offsets: wp.array(dtype=int),
         object_id: wp.array(dtype=int),
-        objects: wp.array2d(dtype=int),
-        points: wp.array2d(dtype=scalar),
-        corners: wp.array2d(dtype=int),
+        objects: wp.array(dtype=wp.vec3i),
         grad_fragment_thickness: wp.array(dtype=scalar),
         grad_maps: wp.array2d(dtype=scalar),
     ):
@@ -318,15 +324,15 @@ def _maps_kernel(scalar: Any) -> wp.Kernel:
                 for fragment in range(offsets[pixel], offsets[pixel + 1]):
                     face = fragment_face[fragment]
                     item = object_id[face]
-                    if objects[item, OBJECT_MAP] == map:
+                    if objects[item][OBJECT_MAP] == map:
                         hit = hit_weights(
-                            load_point(points, corners[face, 0]),
-                            load_point(points, corners[face, 1]),
-                            load_point(points, corners[face, 2]),
+                            load_point(points, corners[face][0]),
+                            load_point(points, corners[face][1]),
+                            load_point(points, corners[face][2]),
                             x, y, rays.scale, rays.perspective,
                         )  # fmt: skip
                         depth = hit[2] * stretch(x, y, rays.scale, rays.perspective)
-                        scale = thickness_scale(depth, objects[item, OBJECT_IN_P], rays.near, rays.far)
+                        scale = thickness_scale(depth, objects[item][OBJECT_IN_P], rays.near, rays.far)
                         sum += scale * wp.float64(grad_fragment_thickness[fragment])
                 grad_maps[map, rays.first_row * rays.width + pixel] = scalar(sum)
 
@@ -340,20 +346,20 @@ def shade_backward(
     **options: Any,
 ) -> None:
     """Fill those gradients of `SHADE_TENSORS` that are not None, given those of `SHADE_OUTPUTS`."""
-    arguments = present(inputs)
-    points, corners, fragment_face, offsets, object_id, objects = (arguments[at] for at in (0, 4, 5, 6, 7, 8))
+    points, corners, fragment_face = inputs[0], inputs[4], inputs[5]
     device, window = points.device, Window(**options)
+    arguments = present(inputs)
     grads = [
-        grad if grad is not None else wp.empty((0,) * ndim, dtype=points.dtype, device=device)
-        for grad, ndim in zip(grad_outputs[:3], (2, 1, 1), strict=True)
+        grad if grad is not None else wp.empty(shape, dtype=points.dtype, device=device)
+        for grad, shape in zip(grad_outputs[:3], ((0, 4), (0,), (0,)), strict=True)
     ]
+    grads[0] = vectors(grads[0])
     to_points, to_rgba, to_thickness, to_maps = grad_inputs[:4]
     if to_maps is not None:
         to_maps.zero_()
         if grad_outputs[2] is not None and fragment_face.shape[0]:
-            fixed = [fragment_face, offsets, object_id, objects, points, corners]
-            inputs = [window.rays(), *fixed, grads[2], to_maps]
-            launch(_maps_kernel(points.dtype), window.pixel_count, inputs, device)
+            fixed = [arguments[SHADE_TENSORS.index(name)] for name in _MAPS_TENSORS]
+            launch(_maps_kernel(points.dtype), window.pixel_count, [window.rays(), *fixed, grads[2], to_maps], device)
     targets = [array for array in (to_points, to_rgba, to_thickness) if array is not None]
     if not targets:
         return
@@ -367,8 +373,12 @@ def shade_backward(
         wp.empty((0 if target is None else strip_count, 3), dtype=dtype, device=device)
         for target, dtype in ((to_points, wp.vec3d), (to_rgba, wp.vec4d), (to_thickness, wp.float64))
     ]
-    inputs = [window.rays(), *arguments, *grads, triangles.boxes, strip_ends, *sums]
-    launch(_strip_kernel(points.dtype), strip_count, inputs, device)
+    launch(
+        _strip_kernel(points.dtype),
+        strip_count,
+        [window.rays(), *arguments, *grads, vectors(triangles.boxes), strip_ends, *sums],
+        device,
+    )
     gather_corners(corners, strip_ends, sums, (to_points, to_rgba, to_thickness), points.dtype)
 
 

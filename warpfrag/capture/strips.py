@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from warpfrag.capture.raster import MOST_FRAGMENTS
+from warpfrag.capture.ray import vectors
 from warpfrag.interop.launch import Span, launch
 
 wp.set_module_options({"enable_backward": False})
@@ -23,11 +24,12 @@ def rows_of_strip(left: int, right: int) -> int:
 
 
 @wp.kernel(module="unique", enable_backward=False)
-def count_strips(span: Span, boxes: wp.array2d[int], counts: wp.array[int]):
+def count_strips(span: Span, boxes: wp.array[wp.vec4i], counts: wp.array[int]):
     """Count the strips of each triangle."""
     for face in range(span.begin + wp.tid(), span.end, span.stride):
-        rows = rows_of_strip(boxes[face, 2], boxes[face, 3])
-        counts[face] = (boxes[face, 1] - boxes[face, 0] + rows - 1) // rows
+        box = boxes[face]
+        rows = rows_of_strip(box[2], box[3])
+        counts[face] = (box[1] - box[0] + rows - 1) // rows
 
 
 @wp.func
@@ -115,7 +117,7 @@ def gather_corners(
 def cut_strips(boxes: wp.array) -> tuple[wp.array, int]:
     """Return where each triangle's strips end, counted over all triangles, and their number."""
     counts = wp.empty(boxes.shape[0], dtype=int, device=boxes.device)
-    launch(count_strips, boxes.shape[0], [boxes, counts], boxes.device)
+    launch(count_strips, boxes.shape[0], [vectors(boxes), counts], boxes.device)
     count = int(counts.numpy().sum(dtype=np.int64))
     if count > MOST_FRAGMENTS:
         raise ValueError(f"capture: {count} strips of triangles, expected at most {MOST_FRAGMENTS}")

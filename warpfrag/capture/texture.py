@@ -18,18 +18,13 @@ def mix3(a: Any, b: Any, c: Any, l_b: wp.float64, l_c: wp.float64):
 @wp.func
 def load_rgba(rgba: Any, vertex: int) -> wp.vec4d:
     """Return a colour and opacity in double precision."""
-    return wp.vec4d(
-        wp.float64(rgba[vertex, 0]),
-        wp.float64(rgba[vertex, 1]),
-        wp.float64(rgba[vertex, 2]),
-        wp.float64(rgba[vertex, 3]),
-    )
+    return wp.vec4d(rgba[vertex])
 
 
 @wp.func
-def load_uv(uv: wp.array2d[float], vertex: int) -> wp.vec2d:
+def load_uv(uv: wp.array[wp.vec2f], vertex: int) -> wp.vec2d:
     """Return the texture coordinates of a vertex in double precision."""
-    return wp.vec2d(wp.float64(uv[vertex, 0]), wp.float64(uv[vertex, 1]))
+    return wp.vec2d(uv[vertex])
 
 
 @wp.struct
@@ -55,17 +50,20 @@ def texture_place(uv: wp.vec2d, size: wp.vec2d) -> wp.vec2d:
 
 
 @wp.func
-def load_texel(texels: wp.array2d[float], textures: wp.array2d[int], texture: int, row: int, column: int) -> wp.vec4d:
+def load_texel(
+    texels: wp.array[wp.vec4f], textures: wp.array[wp.vec3i], texture: int, row: int, column: int
+) -> wp.vec4d:
     """Return a texel of an image that repeats; row and column are at least 0."""
-    width = textures[texture, 2]
-    return load_rgba(texels, textures[texture, 0] + (row % textures[texture, 1]) * width + column % width)
+    image = textures[texture]
+    return load_rgba(texels, image[0] + (row % image[1]) * image[2] + column % image[2])
 
 
 @wp.func
-def look_up(texels: wp.array2d[float], textures: wp.array2d[int], texture: int, uv: wp.vec2d) -> Lookup:
+def look_up(texels: wp.array[wp.vec4f], textures: wp.array[wp.vec3i], texture: int, uv: wp.vec2d) -> Lookup:
     """Return what `texel_between` takes, for a place in texture coordinates."""
     at = Lookup()
-    at.size = wp.vec2d(wp.float64(textures[texture, 2]), wp.float64(textures[texture, 1]))
+    image = textures[texture]
+    at.size = wp.vec2d(wp.float64(image[2]), wp.float64(image[1]))
     place = texture_place(uv, at.size)
     at.before = wp.vec2d(wp.floor(place[0]), wp.floor(place[1]))
     # Repeating as float first: uv may be far outside what an int32 holds.

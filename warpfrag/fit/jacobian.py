@@ -44,6 +44,8 @@ class Evaluation:
         self.values = problem.values(coordinates)
         self.variables = problem.study.variables
         keys = {variable.key for variable in self.variables}
+        # A scene that is out of sight has no fragments to differentiate by.
+        keys = keys if self.unit.fragments.count else set()
         single = {name: value.astype(np.float32) for name, value in self.values.items()}
         fragments = self.unit.scaled(single)
         device = problem.study.device
@@ -91,7 +93,8 @@ class Evaluation:
         """
         background = self.problem.background
         # Opacity does not depend on beta, thickness or colour: no pass where it cannot change.
-        if channel == 3 and (background[3] == 1.0 or all(variable.key != "opacity" for variable in self.variables)):
+        fixed = channel == 3 and (background[3] == 1.0 or all(v.key != "opacity" for v in self.variables))
+        if fixed or not self.unit.fragments.count:
             return np.zeros((len(self.residual), sum(variable.start.size for variable in self.variables)))
         seed = np.zeros(self.raw.shape, np.float32)
         seed[..., channel] = 1.0

@@ -80,7 +80,8 @@ def launch(kernel: wp.Kernel, size: int, inputs: Sequence[Any], device: wp.Devic
     if threads == 1:
         wp.launch(kernel, dim=1, inputs=[_span(0, size, 1, 0), *inputs], device=device, record_tape=False)
         return
-    load(kernel, device)
+    # Loading a module from several threads at once is not safe. CPU kernels are launched with blocks of one.
+    wp.load_module(kernel.module, device, block_dim=1)
     piece = max(SMALLEST_PIECE, -(-size // (threads * PIECES_PER_THREAD)))
     begins = range(0, size, piece)
     pool, slot = _pool(threads)
@@ -91,11 +92,6 @@ def launch(kernel: wp.Kernel, size: int, inputs: Sequence[Any], device: wp.Devic
 
     for _ in pool.map(run, begins):
         pass
-
-
-def load(kernel: wp.Kernel, device: wp.Device) -> None:
-    """Compile and load the kernel's module if need be (loading from several threads at once is not safe)."""
-    kernel.module.load(device)
 
 
 def _span(begin: int, end: int, stride: int, worker: int) -> Span:

@@ -174,4 +174,3 @@ def _add_kernel(scalar: Any) -> wp.Kernel:
 
 
 _add = {wp.float32: _add_kernel(wp.float32), wp.float64: _add_kernel(wp.float64)}
-

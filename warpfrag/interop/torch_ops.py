@@ -23,7 +23,7 @@ def register(operator: Operator) -> None:
     """Define `torch.ops.warpfrag.<name>` and `<name>_backward`: what they compute, their shapes, their gradient."""
     tensor_count, output_count = len(operator.tensors), len(operator.outputs)
     arguments_schema = ", ".join(
-        [*(f"Tensor? {name}" for name in operator.tensors), *(f"{kind} {name}" for name, kind in operator.options.items())]
+        [f"Tensor? {name}" for name in operator.tensors] + [f"{kind} {name}" for name, kind in operator.options.items()]
     )
     grads_schema = ", ".join(f"Tensor? grad_{name}" for name in operator.outputs)
 

@@ -1,7 +1,7 @@
 """What resolving and compositing take in common: their options, beta, and checks of values."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -30,11 +30,11 @@ Mix = Literal["opacity", "average", "optical_depth"]
 MERGES = {"none": MERGE_NONE, "smooth": MERGE_SMOOTH, "order_independent": MERGE_ORDER_INDEPENDENT}
 MIXES = {"opacity": MIX_OPACITY, "average": MIX_AVERAGE, "optical_depth": MIX_OPTICAL_DEPTH}
 
-# The structures of each precision.
-SLABS = {wp.float32: Slab32, wp.float64: Slab64}
-PIXELS = {wp.float32: Pixels32, wp.float64: Pixels64}
-GRADIENTS = {wp.float32: Gradients32, wp.float64: Gradients64}
-SCRATCH = {wp.float32: Scratch32, wp.float64: Scratch64}
+# The structures of each precision. (Any: kernels take these as types of arguments.)
+SLABS: dict[Any, Any] = {wp.float32: Slab32, wp.float64: Slab64}
+PIXELS: Any = {wp.float32: Pixels32, wp.float64: Pixels64}
+GRADIENTS: Any = {wp.float32: Gradients32, wp.float64: Gradients64}
+SCRATCH: Any = {wp.float32: Scratch32, wp.float64: Scratch64}
 
 # Tensors and options that operators on fragments share, in this order.
 FRAGMENT_TENSORS = ("rgba", "depth", "thickness", "offsets", "beta", "opacity_sum")
@@ -119,7 +119,7 @@ class Walk:
     Scratch memory has a row for each thread that runs at the same time, as long as the longest list of fragments.
     """
 
-    def __init__(self, inputs: Sequence[wp.array | None], max_layers: int, merge: str, mix: str):
+    def __init__(self, inputs: Sequence[Any], max_layers: int, merge: str, mix: str):
         """Take the operator's inputs `FRAGMENT_TENSORS` and options `MERGE_OPTIONS`."""
         rgba, depth, thickness, offsets, beta, opacity_sum = inputs
         self.inputs = inputs
@@ -137,23 +137,22 @@ class Walk:
             self.pixels.opacity_sum = opacity_sum
         self.pixels.floor = LOG_OPAQUE if mix == "optical_depth" else LOG_FLOOR
         self.pixels.max_layers = max_layers
-        self.pixels.merge_kind = MERGES[merge]
-        self.pixels.mix = MIXES[mix]
+        self.choice = (self.scalar, MERGES[merge], MIXES[mix])
 
     def optional(self, array: wp.array | None, ndim: int) -> wp.array:
         """Return the array, or an empty one in place of None: kernels skip those."""
         return array if array is not None else wp.empty((0,) * ndim, dtype=self.scalar, device=self.device)
 
-    def forward(self, kernel: wp.Kernel, outputs: Sequence[wp.array]) -> None:
-        """Run a kernel that takes pixels, order, length, invalid and outputs; raise if it finds invalid values."""
+    def forward(self, kernel: Callable[..., wp.Kernel], outputs: Sequence[wp.array]) -> None:
+        """Run the kernel made for the merge and mix, which takes pixels, order, length, invalid and outputs; raise if it finds invalid values."""
         rows = worker_count(self.pixel_count, self.device, 4 * self.length)
         order = wp.empty(rows * self.length, dtype=wp.int32, device=self.device)
         invalid = wp.array(np.full((rows, 2), NO_FRAGMENT, np.int32), device=self.device)
-        launch(kernel, self.pixel_count, [self.pixels, order, self.length, invalid, *outputs], self.device, rows)
+        launch(kernel(*self.choice), self.pixel_count, [self.pixels, order, self.length, invalid, *outputs], self.device, rows)
         report_invalid(invalid, self.inputs)
 
-    def backward(self, kernel: wp.Kernel, grads: Sequence[wp.array], grad_inputs: Sequence[wp.array | None]) -> None:
-        """Run a kernel that takes pixels, scratch, output gradients and input gradients."""
+    def backward(self, kernel: Callable[..., wp.Kernel], grads: Sequence[wp.array], grad_inputs: Sequence[wp.array | None]) -> None:
+        """Run the kernel made for the merge and mix, which takes pixels, scratch, output gradients and input gradients."""
         slab = SLABS[self.scalar]
         rows = worker_count(self.pixel_count, self.device, (8 + 21 * wp.types.type_size_in_bytes(self.scalar)) * self.length)
         scratch = SCRATCH[self.scalar]()
@@ -175,7 +174,7 @@ class Walk:
             targets.opacity_sum = grad_opacity_sum
         if grad_beta is not None:
             targets.beta = wp.empty(self.pixel_count, dtype=self.scalar, device=self.device)
-        launch(kernel, self.pixel_count, [self.pixels, scratch, *grads, targets], self.device, rows)
+        launch(kernel(*self.choice), self.pixel_count, [self.pixels, scratch, *grads, targets], self.device, rows)
         if grad_beta is not None:
             sum_beta(targets.beta, grad_beta)
 
@@ -216,7 +215,7 @@ def longest_list(offsets: wp.array, fragment_count: int) -> int:
     return int(found[:, 0].max())
 
 
-def report_invalid(invalid: wp.array, inputs: Sequence[wp.array | None]) -> None:
+def report_invalid(invalid: wp.array, inputs: Sequence[Any]) -> None:
     """Raise for the first fragment or pixel that a kernel found to have values out of range.
 
     Args:

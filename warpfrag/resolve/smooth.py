@@ -53,6 +53,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func(inline=True)
 def store_layer(s: Any, pixel: int, layer: int, rgba: Any, depth: Any, thickness: Any, opacity_sum: Any):
+    """Write a slab as a layer of a pixel."""
     rgba[pixel, layer, 0] = s.c[0]
     rgba[pixel, layer, 1] = s.c[1]
     rgba[pixel, layer, 2] = s.c[2]
@@ -82,7 +83,7 @@ def load_layer_grad(s: Any, pixel: int, layer: int, rgba: Any, depth: Any, thick
 
 
 @cache
-def _forward_kernel(scalar: Any) -> wp.Kernel:
+def _forward_kernel(scalar: Any, merge_kind: int, mix: int) -> wp.Kernel:
     @wp.kernel(module="unique", enable_backward=False)
     def resolve_fwd(
         span: Span,
@@ -110,18 +111,18 @@ def _forward_kernel(scalar: Any) -> wp.Kernel:
                 fragment = order[base + position]
                 if not valid_fragment(pixels, fragment):
                     wp.atomic_min(invalid, span.worker, 0, fragment)
-                following = load_slab(pixels, fragment)
+                following = load_slab(pixels, fragment, merge_kind)
                 step = int(STEP_START)
                 if position > 0:
-                    step = choose_step(pixels, running, following, layer)
+                    step = choose_step(running, following, layer, pixels.max_layers, merge_kind)
                 if step == STEP_START:
                     if position > 0:
                         store_layer(running, pixel, layer, rgba, depth, thickness, opacity_sum)
                         layer += 1
                     running = following
                 else:
-                    front, back = step_powers(pixels, step, running, following)
-                    running = take_step(pixels, step, running, following, beta, front, back)
+                    front, back = step_powers(step, running, following, merge_kind, pixels.floor)
+                    running = take_step(step, running, following, beta, front, back, merge_kind, mix)
             if count > 0:
                 store_layer(running, pixel, layer, rgba, depth, thickness, opacity_sum)
                 layer += 1
@@ -133,7 +134,7 @@ def _forward_kernel(scalar: Any) -> wp.Kernel:
 
 
 @cache
-def _backward_kernel(scalar: Any) -> wp.Kernel:
+def _backward_kernel(scalar: Any, merge_kind: int, mix: int) -> wp.Kernel:
     @wp.kernel(module="unique", enable_backward=False)
     def resolve_bwd(
         span: Span,
@@ -149,7 +150,7 @@ def _backward_kernel(scalar: Any) -> wp.Kernel:
         for pixel in range(span.begin + wp.tid(), span.end, span.stride):
             count = pixels.offsets[pixel + 1] - pixels.offsets[pixel]
             beta = pixel_beta(pixels, pixel)
-            layer = replay(pixels, pixel, scratch, base)
+            layer = replay(pixels, pixel, merge_kind, mix, scratch, base)
             g = zero_slab(scalar(0.0))
             g_beta = scalar(0.0)
             ends_layer = bool(True)
@@ -165,7 +166,6 @@ def _backward_kernel(scalar: Any) -> wp.Kernel:
                 g_fragment = g
                 if step != STEP_START:
                     g_running, g_following, g_step = take_step_adjoint(
-                        pixels,
                         step,
                         g,
                         scratch.running[at - 1],
@@ -173,6 +173,9 @@ def _backward_kernel(scalar: Any) -> wp.Kernel:
                         beta,
                         scratch.front[at],
                         scratch.back[at],
+                        merge_kind,
+                        mix,
+                        pixels.floor,
                     )
                     g = g_running
                     g_fragment = g_following
@@ -192,13 +195,13 @@ def _output_like(inputs: Sequence[Any], max_layers: int, merge: str, mix: str) -
 
 def _forward(inputs: Sequence[Any], outputs: Sequence[Any], **options: Any) -> None:
     walk = Walk(inputs, **options)
-    walk.forward(_forward_kernel(walk.scalar), outputs)
+    walk.forward(_forward_kernel, outputs)
 
 
 def _backward(inputs: Sequence[Any], grad_outputs: Sequence[Any], grad_inputs: Sequence[Any], **options: Any) -> None:
     walk = Walk(inputs, **options)
     grads = [walk.optional(grad, ndim) for grad, ndim in zip(grad_outputs[:4], (3, 2, 2, 2), strict=True)]
-    walk.backward(_backward_kernel(walk.scalar), grads, grad_inputs)
+    walk.backward(_backward_kernel, grads, grad_inputs)
 
 
 _RESOLVE = Operator(

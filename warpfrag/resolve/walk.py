@@ -4,6 +4,9 @@ The steps are Algorithm 1 of the fragment-merging paper. A step either starts a 
 running one, or adds it to the tail. Which of the three happens, and the order, is a discrete choice: the adjoint holds
 it fixed. The way back needs the running slab before each step; `replay` recomputes all of them into scratch memory that
 belongs to the thread, so the forward pass stores nothing for the gradient.
+
+Kernels are made for one way to merge and mix: those are constants in them, and as every function here is inlined, the
+compiler drops the branches that are not taken.
 """
 
 from typing import Any
@@ -40,7 +43,7 @@ NO_FRAGMENT = wp.constant(2147483647)
 
 @wp.struct
 class Pixels32:
-    """The fragments of all pixels, and how to merge them. Optional arrays are empty where there is nothing."""
+    """The fragments of all pixels. `opacity_sum` may be empty; `floor` is the least log T of a slab that is divided."""
 
     rgba: wp.array[wp.vec4f]
     depth: wp.array[wp.float32]
@@ -50,8 +53,6 @@ class Pixels32:
     opacity_sum: wp.array[wp.float32]
     floor: wp.float32
     max_layers: wp.int32
-    merge_kind: wp.int32
-    mix: wp.int32
 
 
 @wp.struct
@@ -66,8 +67,6 @@ class Pixels64:
     opacity_sum: wp.array[wp.float64]
     floor: wp.float64
     max_layers: wp.int32
-    merge_kind: wp.int32
-    mix: wp.int32
 
 
 @wp.struct
@@ -165,7 +164,7 @@ def sort_pixel(pixels: Any, begin: int, count: int, order: wp.array[wp.int32], b
 
 
 @wp.func(inline=True)
-def load_slab(pixels: Any, fragment: int):
+def load_slab(pixels: Any, fragment: int, merge_kind: int):
     """Return a fragment as a slab."""
     rgba = pixels.rgba[fragment]
     a = rgba[3]
@@ -174,7 +173,7 @@ def load_slab(pixels: Any, fragment: int):
     if pixels.opacity_sum.shape[0] > 0 and a > type(a)(0.0):
         weight = pixels.opacity_sum[fragment] / a
     log_t = type(a)(0.0)
-    if pixels.merge_kind == MERGE_SMOOTH:
+    if merge_kind == MERGE_SMOOTH:
         # Nothing else reads it, and it costs a third of all the rest.
         log_t = log_transmittance(a)
     z = pixels.depth[fragment]
@@ -230,41 +229,43 @@ def valid_beta(pixels: Any, pixel: int):
 
 
 @wp.func(inline=True)
-def choose_step(pixels: Any, running: Any, following: Any, layer: int):
+def choose_step(running: Any, following: Any, layer: int, max_layers: int, merge_kind: int):
     """Return what happens to the slab that follows the running one, which is to become layer number `layer`."""
-    if pixels.merge_kind != MERGE_NONE and overlap(running, following):
+    if merge_kind != MERGE_NONE and overlap(running, following):
         return STEP_MERGE
-    if layer < pixels.max_layers - 1:
+    if layer < max_layers - 1:
         return STEP_START
     return STEP_TAIL
 
 
 @wp.func(inline=True)
-def step_powers(pixels: Any, step: int, a: Any, b: Any):
+def step_powers(step: int, a: Any, b: Any, merge_kind: int, floor: Any):
     """Return the `sfm_powers` of a step, which is of no other kind if they are to mean anything."""
-    one = type(pixels.floor)(1.0)
-    if step == STEP_MERGE and pixels.merge_kind == MERGE_SMOOTH:
-        return sfm_powers(a, b, pixels.floor)
+    one = type(floor)(1.0)
+    if step == STEP_MERGE and merge_kind == MERGE_SMOOTH:
+        return sfm_powers(a, b, floor)
     return one, one
 
 
 @wp.func(inline=True)
-def take_step(pixels: Any, step: int, a: Any, b: Any, beta: Any, front: Any, back: Any):
+def take_step(step: int, a: Any, b: Any, beta: Any, front: Any, back: Any, merge_kind: int, mix: int):
     """Return the running slab after a step that is not a start, given its `step_powers`."""
     if step == STEP_TAIL:
         return over(a, b)
-    if pixels.merge_kind == MERGE_SMOOTH:
-        return sfm(a, b, beta, pixels.mix, front, back)
-    return ofm(a, b, pixels.mix)
+    if merge_kind == MERGE_SMOOTH:
+        return sfm(a, b, beta, mix, front, back)
+    return ofm(a, b, mix)
 
 
 @wp.func(inline=True)
-def take_step_adjoint(pixels: Any, step: int, g: Any, a: Any, b: Any, beta: Any, front: Any, back: Any):
+def take_step_adjoint(
+    step: int, g: Any, a: Any, b: Any, beta: Any, front: Any, back: Any, merge_kind: int, mix: int, floor: Any
+):
     """Return the gradients in a, b and beta of <g, take_step(...)>."""
-    if step == STEP_MERGE and pixels.merge_kind == MERGE_SMOOTH:
-        return sfm_adjoint(g, a, b, beta, pixels.mix, pixels.floor, front, back)
+    if step == STEP_MERGE and merge_kind == MERGE_SMOOTH:
+        return sfm_adjoint(g, a, b, beta, mix, floor, front, back)
     if step == STEP_MERGE:
-        ofm_a, ofm_b = ofm_adjoint(g, a, b, pixels.mix)
+        ofm_a, ofm_b = ofm_adjoint(g, a, b, mix)
         return ofm_a, ofm_b, type(beta)(0.0)
     over_a, over_b = over_adjoint(g, a, b)
     return over_a, over_b, type(beta)(0.0)
@@ -277,7 +278,7 @@ def zero_slab(zero: Any):
 
 
 @wp.func(inline=True)
-def replay(pixels: Any, pixel: int, scratch: Any, base: int):
+def replay(pixels: Any, pixel: int, merge_kind: int, mix: int, scratch: Any, base: int):
     """Walk through a pixel's fragments, record every position in `scratch`, and return the number of layers."""
     begin = pixels.offsets[pixel]
     count = pixels.offsets[pixel + 1] - begin
@@ -287,18 +288,18 @@ def replay(pixels: Any, pixel: int, scratch: Any, base: int):
     through = type(beta)(1.0)
     running = zero_slab(type(beta)(0.0))
     for position in range(count):
-        following = load_slab(pixels, scratch.order[base + position])
+        following = load_slab(pixels, scratch.order[base + position], merge_kind)
         step = int(STEP_START)
         if position > 0:
-            step = choose_step(pixels, running, following, layer)
+            step = choose_step(running, following, layer, pixels.max_layers, merge_kind)
         if step == STEP_START:
             if position > 0:
                 layer += 1
                 through *= running.t
             running = following
         else:
-            front, back = step_powers(pixels, step, running, following)
-            running = take_step(pixels, step, running, following, beta, front, back)
+            front, back = step_powers(step, running, following, merge_kind, pixels.floor)
+            running = take_step(step, running, following, beta, front, back, merge_kind, mix)
             scratch.front[base + position] = front
             scratch.back[base + position] = back
         scratch.step[base + position] = step
