@@ -1,7 +1,44 @@
-"""A differentiable multi-fragment compositor."""
+"""A differentiable multi-fragment compositor on NVIDIA Warp.
 
+A scene is captured into per-pixel fragments, fragments are resolved into a few layers, layers are composited into an
+image, and every step can be differentiated, on the CPU and on CUDA from the same kernels:
+
+    fragments = wf.capture(wf.load_scene("scene.toml"))
+    layers = wf.resolve(fragments, beta=0.5, max_layers=8)
+    image = wf.composite(layers)
+
+`wf.render` does all of it, `wf.composite(fragments, ...)` the last two at once, `wf.fit` finds the parameters of a scene
+from an image. Arrays may be torch tensors, Warp arrays or NumPy arrays: what goes in comes out.
+"""
+
+from warpfrag.capture.capture import capture
+from warpfrag.capture.precision import z_resolution
+from warpfrag.capture.render import render
 from warpfrag.composite import composite
+from warpfrag.fit import FitError, FitResult, Study, StudyError, fit, load_study
 from warpfrag.fragments import Fragments, Layers
 from warpfrag.resolve.smooth import resolve
+from warpfrag.scene import Camera, Scene, SceneError, SceneObject, load_scene
 
-__all__ = ["Fragments", "Layers", "composite", "resolve"]
+__version__ = "0.1.0"
+
+__all__ = [
+    "Camera",
+    "FitError",
+    "FitResult",
+    "Fragments",
+    "Layers",
+    "Scene",
+    "SceneError",
+    "SceneObject",
+    "Study",
+    "StudyError",
+    "capture",
+    "composite",
+    "fit",
+    "load_scene",
+    "load_study",
+    "render",
+    "resolve",
+    "z_resolution",
+]

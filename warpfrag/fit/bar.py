@@ -55,6 +55,8 @@ def progress_bar(name: str) -> Iterator[Any]:
             # The line that tells what went wrong is to stand alone.
             bar.live.transient = True
             raise
+        done = bar.tasks[0].completed
+        bar.update(task, total=done)
 
 
 def _lines(name: str) -> Any:

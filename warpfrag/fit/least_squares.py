@@ -16,6 +16,10 @@ from warpfrag.fit.outcome import Outcome
 from warpfrag.fit.problem import Problem
 from warpfrag.fit.session import FitError, Session, check_finite
 
+# Images are made from float32 values: a relative change below their spacing is none.
+SMALLEST_STEP = 2.0**-23
+# SciPy takes no tolerance below this.
+EPSILON = 1e-15
 # Random starts keep this share of the range away from the bounds.
 _MARGIN = 0.1
 _REASONS = {
@@ -124,9 +128,9 @@ def least_squares(problem: Problem, session: Session) -> Outcome:
             bounds=(lower, upper),
             method="trf",
             x_scale="jac",
-            ftol=study.tolerance or None,
-            xtol=study.tolerance or None,
-            gtol=1e-15,
+            ftol=study.tolerance if study.tolerance > EPSILON else None,
+            xtol=max(study.tolerance, SMALLEST_STEP),
+            gtol=EPSILON,
             max_nfev=study.steps,
         )
         if best is None or found.cost < best.cost:

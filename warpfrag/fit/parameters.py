@@ -94,7 +94,8 @@ class Variable:
 
     def outward(self, coordinate: Any) -> Any:
         """Return the value of a coordinate, an array or a tensor."""
-        if isinstance(coordinate, (np.ndarray, np.generic)):
+        if isinstance(coordinate, (np.ndarray, np.floating)):
+            coordinate = np.asarray(coordinate)
             return np.clip(np.exp(coordinate), self.lower, self.upper) if self.logarithm else coordinate * self.unit
         # Rounding must not carry a bound across itself.
         return coordinate.exp().clamp(self.lower, self.upper) if self.logarithm else coordinate * self.unit

@@ -22,7 +22,7 @@ def draw_error(result: "FitResult", path: Path) -> None:
         result: the fit.
         path: the PNG file.
     """
-    pyplot = _pyplot()
+    matplotlib, figure_class = _matplotlib()
     channels = result.reference.shape[2]
     panels = [
         (title, np.abs(image[..., :channels] - result.reference))
@@ -32,8 +32,9 @@ def draw_error(result: "FitResult", path: Path) -> None:
     # Panels 4 inches wide, higher or lower as the image is, within reason.
     tall = float(np.clip(4.0 * height / width, 2.0, 7.0))
     label = "|image − reference|, largest of the channels, linear light"
-    with pyplot.rc_context(_STYLE):
-        figure, axes = pyplot.subplots(1, 2, figsize=(10.4, tall + 0.4), layout="constrained")
+    with matplotlib.rc_context(_STYLE):
+        figure = figure_class(figsize=(10.4, tall + 0.4), layout="constrained")
+        axes = figure.subplots(1, 2)
         for axis, (title, error) in zip(axes, panels, strict=True):
             root = float(np.sqrt(np.mean(np.square(error, dtype=np.float64))))
             largest = error.max(axis=2)
@@ -57,13 +58,14 @@ def draw_loss(result: "FitResult", path: Path) -> None:
         result: the fit.
         path: the PNG file.
     """
-    pyplot = _pyplot()
+    matplotlib, figure_class = _matplotlib()
     steps = np.arange(1, len(result.losses) + 1)
     # Zero has no place on a logarithmic scale; a loss that small is rounding.
     losses = np.maximum(np.asarray(result.losses, dtype=np.float64), 1e-20)
     method = str(result.setting.get("method", "")).replace("_", " ")
-    with pyplot.rc_context(_STYLE):
-        figure, axis = pyplot.subplots(figsize=(6.4, 4.0), layout="constrained")
+    with matplotlib.rc_context(_STYLE):
+        figure = figure_class(figsize=(6.4, 4.0), layout="constrained")
+        axis = figure.subplots()
         marker = "o" if len(steps) <= 60 else ""
         axis.semilogy(steps, losses, marker=marker, markersize=3.5, linewidth=0.8, color="#8aa4c8", label="loss")
         axis.semilogy(steps, np.minimum.accumulate(losses), linewidth=1.6, color="#1f3b63", label="best so far")
@@ -76,16 +78,12 @@ def draw_loss(result: "FitResult", path: Path) -> None:
         _save(figure, path)
 
 
-def _pyplot() -> Any:
-    matplotlib = need("matplotlib", "fit", "The report of a fit")
-    # Without a display, and without taking one where there is one.
-    matplotlib.use("Agg", force=False)
-    return need("matplotlib.pyplot", "fit", "The report of a fit")
+def _matplotlib() -> tuple[Any, Any]:
+    """Return matplotlib and its class of figures, which draws to files without pyplot and its choice of a display."""
+    purpose = "The report of a fit"
+    return need("matplotlib", "fit", purpose), need("matplotlib.figure", "fit", purpose).Figure
 
 
 def _save(figure: Any, path: Path) -> None:
-    import matplotlib.pyplot as plt
-
     with replacing(path) as partial:
         figure.savefig(partial, format="png")
-    plt.close(figure)
