@@ -5,7 +5,8 @@ import pytest
 import torch
 from capture_scenes import orthographic, perspective, quad, scene, soup, surface
 
-import warpfrag.capture.memory as memory
+from warpfrag.capture import memory
+from warpfrag.capture import render as render_module
 from warpfrag.capture.capture import capture
 from warpfrag.capture.render import render
 from warpfrag.composite import composite
@@ -99,9 +100,12 @@ def test_bands_have_the_same_pixels(monkeypatch):
                     quad(2.2, name="map", opacity=0.5, thickness=random.uniform(0, 1, (36, 40))))  # fmt: skip
     beta = random.uniform(0, 1, (36, 40)).astype(np.float32)
     bands = []
-    monkeypatch.setattr(
-        "warpfrag.capture.render.split_rows", lambda *a: bands.append(memory.split_rows(*a)) or bands[-1]
-    )
+
+    def split_rows(*arguments):
+        bands.append(memory.split_rows(*arguments))
+        return bands[-1]
+
+    monkeypatch.setattr(render_module, "split_rows", split_rows)
     whole = render(setting, beta=beta)
     assert not bands
     for limit in limits(setting):

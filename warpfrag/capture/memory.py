@@ -73,9 +73,9 @@ def fragment_bytes(scalar: type, gradient: bool) -> int:
 def fixed_bytes(triangles: Triangles, gradient: bool) -> int:
     """Return the bytes that a capture takes whatever the number of fragments."""
     corner_count = triangles.corners.size
-    bytes = 16 * (corner_count // 3) + 4 * corner_count
+    seen = corner_count // 3 if triangles.listed is None else triangles.listed.shape[0]
+    bytes = 16 * (corner_count // 3) + 4 * corner_count + 4 * seen
     if gradient:
-        seen = corner_count // 3 if triangles.listed is None else triangles.listed.shape[0]
         bytes += STRIP_BYTES * seen + CORNER_SORT_BYTES * (corner_count // 3)
     return bytes
 

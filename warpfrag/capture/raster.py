@@ -32,6 +32,9 @@ from warpfrag.interop.launch import Span, launch
 wp.set_module_options({"enable_backward": False})
 
 MOST_FRAGMENTS = 2**31 - 1
+# Rows of a band: few, so that a piece of work looks at few triangles that it does not cover; not so few that most
+# triangles lie in several.
+BAND_ROWS = wp.constant(16)
 
 
 @dataclass(frozen=True)
@@ -42,15 +45,17 @@ class Triangles:
         points: corners in camera space, float32 or float64, (V, 3).
         corners: indices into `points`, those of a triangle ordered by their coordinates, (N, 3) int32.
         boxes: rows and columns [top, bottom) x [left, right) of the window that a triangle may cover, (N, 4) int32.
-        listed: the triangles whose box is not empty, int32; None for all.
         window: the pixels.
+        listed: for each band of rows the triangles whose box reaches into it, int32; None on CUDA.
+        band_begins: band b has the triangles listed[band_begins[b] : band_begins[b + 1]], int32; None on CUDA.
     """
 
     points: wp.array
     corners: wp.array
     boxes: wp.array
-    listed: wp.array | None
     window: Window
+    listed: wp.array | None
+    band_begins: wp.array | None
 
     @property
     def device(self) -> wp.Device:
@@ -105,12 +110,27 @@ def prepare_triangles(points: wp.array, faces: wp.array, window: Window) -> Tria
     boxes = wp.empty((faces.shape[0], 4), dtype=int, device=device)
     inputs = [vectors(points), vectors(faces), window.rays(), vectors(corners), vectors(boxes)]
     launch(_prepare_kernel(points.dtype), faces.shape[0], inputs, device)
-    listed = None
+    listed = band_begins = None
     if device.is_cpu:
-        # Small triangles between pixel centres, or out of the image, are not looked at by every piece again.
-        found = np.flatnonzero(boxes.numpy()[:, 1]).astype(np.int32)
-        listed = wp.array(found, device=device, copy=False) if len(found) else wp.empty(0, dtype=int, device=device)
-    return Triangles(points, corners, boxes, listed, window)
+        lists = _list_by_band(boxes.numpy(), window.row_count)
+        listed, band_begins = (wp.array(array, dtype=int, device=device, copy=False) for array in lists)
+    return Triangles(points, corners, boxes, window, listed, band_begins)
+
+
+def _list_by_band(boxes: np.ndarray, row_count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the triangles of each band of rows, in order of submission, and where each band's begin."""
+    rows = int(BAND_ROWS)
+    band_count = -(-row_count // rows)
+    seen = np.flatnonzero(boxes[:, 1]).astype(np.int32)
+    first = boxes[seen, 0] // rows
+    spans = (boxes[seen, 1] - 1) // rows + 1 - first
+    ends = np.cumsum(spans, dtype=np.int64)
+    total = int(ends[-1]) if len(ends) else 0
+    band = np.repeat(first - (ends - spans), spans) + np.arange(total)
+    # NumPy sorts 16-bit keys by radix.
+    order = np.argsort(band.astype(np.int16 if band_count < 2**15 else np.int32), kind="stable")
+    begins = np.cumsum([0, *np.bincount(band, minlength=band_count)])
+    return np.repeat(seen, spans)[order], begins.astype(np.int32)
 
 
 @cache
@@ -123,6 +143,7 @@ def _rasterize_kernel(scalar: Any) -> wp.Kernel:
         corners: wp.array(dtype=wp.vec3i),
         boxes: wp.array(dtype=wp.vec4i),
         listed: wp.array(dtype=int),
+        band_begins: wp.array(dtype=int),
         rays: Rays,
         slots: wp.array(dtype=int),
         fragment_face: wp.array(dtype=int),
@@ -130,49 +151,58 @@ def _rasterize_kernel(scalar: Any) -> wp.Kernel:
     ):
         first_pixel = int(0)
         end_pixel = rays.width * rays.row_count
-        begin = span.begin + wp.tid()
-        end = span.end
-        stride = span.stride
+        first_band = int(0)
+        end_band = int(1)
         if span_is_pixels != 0:
             first_pixel = span.begin
             end_pixel = span.end
-            begin = 0
-            end = listed.shape[0]
-            stride = 1
-        first_row = first_pixel // rays.width
-        end_row = (end_pixel - 1) // rays.width + 1
-        for item in range(begin, end, stride):
-            face = item
+            first_band = first_pixel // rays.width // BAND_ROWS
+            end_band = (end_pixel - 1) // rays.width // BAND_ROWS + 1
+        for band in range(first_band, end_band):
+            first_row = first_pixel // rays.width
+            end_row = (end_pixel - 1) // rays.width + 1
+            begin = span.begin + wp.tid()
+            end = span.end
+            stride = span.stride
             if span_is_pixels != 0:
-                face = listed[item]
-            box = boxes[face]
-            top = wp.max(box[0], first_row)
-            bottom = wp.min(box[1], end_row)
-            if top < bottom:
+                first_row = wp.max(first_row, band * BAND_ROWS)
+                end_row = wp.min(end_row, (band + 1) * BAND_ROWS)
+                begin = band_begins[band]
+                end = band_begins[band + 1]
+                stride = 1
+            for item in range(begin, end, stride):
+                face = item
+                if span_is_pixels != 0:
+                    face = listed[item]
+                box = boxes[face]
                 left = box[2]
                 right = box[3]
-                corner = corners[face]
-                a = load_point(points, corner[0])
-                b = load_point(points, corner[1])
-                c = load_point(points, corner[2])
-                wide = is_wide(rays, a, b, c, left, right)
-                for row in range(top, bottom):
-                    y = centre_y(rays, row)
-                    columns = wp.vec2i(left, right)
-                    if wide:
-                        columns = columns_of_row(rays, a, b, c, y, left, right)
-                    row_pixel = row * rays.width
-                    for column in range(
-                        wp.max(columns[0], first_pixel - row_pixel), wp.min(columns[1], end_pixel - row_pixel)
-                    ):
-                        x = centre_x(rays, column)
-                        depth = hit_depth(rays, a, b, c, x, y)
-                        if depth > wp.float64(0.0):
-                            slot = wp.atomic_add(slots, row_pixel + column, 1)
-                            if slot < fragment_face.shape[0]:
-                                fragment_face[slot] = face
-                            if slot < fragment_depth.shape[0]:
-                                fragment_depth[slot] = scalar(depth * stretch(x, y, rays.scale, rays.perspective))
+                top = wp.max(box[0], first_row)
+                bottom = wp.min(box[1], end_row)
+                if top < bottom:
+                    corner = corners[face]
+                    a = load_point(points, corner[0])
+                    b = load_point(points, corner[1])
+                    c = load_point(points, corner[2])
+                    wide = is_wide(rays, a, b, c, left, right)
+                    for row in range(top, bottom):
+                        y = centre_y(rays, row)
+                        columns = wp.vec2i(left, right)
+                        if wide:
+                            columns = columns_of_row(rays, a, b, c, y, left, right)
+                        row_pixel = row * rays.width
+                        for column in range(
+                            wp.max(columns[0], first_pixel - row_pixel), wp.min(columns[1], end_pixel - row_pixel)
+                        ):
+                            x = centre_x(rays, column)
+                            depth = hit_depth(rays, a, b, c, x, y)
+                            if depth > wp.float64(0.0):
+                                slot = wp.atomic_add(slots, row_pixel + column, 1)
+                                if slot < fragment_face.shape[0]:
+                                    fragment_face[slot] = face
+                                if slot < fragment_depth.shape[0]:
+                                    along = stretch(x, y, rays.scale, rays.perspective)
+                                    fragment_depth[slot] = scalar(depth * along)
 
     return rasterize
 
@@ -183,9 +213,10 @@ def _rasterize(triangles: Triangles, slots: wp.array, fragment_face: wp.array, f
     size = triangles.window.pixel_count if by_pixels else triangles.corners.shape[0]
     if by_pixels and listed.shape[0] == 0:
         return
+    nothing = _nothing(int, triangles.device)
     inputs = [
         *(int(by_pixels), vectors(triangles.points), vectors(triangles.corners), vectors(triangles.boxes)),
-        *(listed if by_pixels else _nothing(int, triangles.device), triangles.window.rays()),
+        *(listed if by_pixels else nothing, triangles.band_begins if by_pixels else nothing, triangles.window.rays()),
         *(slots, fragment_face, fragment_depth),
     ]
     launch(_rasterize_kernel(triangles.points.dtype), size, inputs, triangles.device)

@@ -47,7 +47,7 @@ from warpfrag.capture.shade import (
     shade_output_like,
     thickness_scale,
 )
-from warpfrag.capture.strips import cut_strips, first_at_least, gather_corners, rows_of_strip
+from warpfrag.capture.strips import cut_strips, gather_corners, rows_of_strip
 from warpfrag.capture.texture import Lookup, load_rgba, load_uv, look_up, mix3, texel_between, texture_place
 from warpfrag.interop.launch import Span, launch
 from warpfrag.interop.operator import Operator
@@ -174,12 +174,13 @@ def _strip_kernel(scalar: Any) -> wp.Kernel:
         grad_fragment_thickness: wp.array(dtype=scalar),
         boxes: wp.array(dtype=wp.vec4i),
         strip_ends: wp.array(dtype=int),
+        strip_faces: wp.array(dtype=int),
         grad_points: wp.array2d(dtype=wp.vec3d),
         grad_rgba: wp.array2d(dtype=wp.vec4d),
         grad_thickness: wp.array2d(dtype=wp.float64),
     ):
         for strip in range(span.begin + wp.tid(), span.end, span.stride):
-            face = first_at_least(strip_ends, strip + 1)
+            face = strip_faces[strip]
             number = strip
             if face > 0:
                 number -= strip_ends[face - 1]
@@ -364,7 +365,8 @@ def shade_backward(
     if not targets:
         return
     triangles = prepare_triangles(points, corners, window)
-    strip_ends, strip_count = cut_strips(triangles.boxes)
+    strip_ends, strip_faces = cut_strips(triangles.boxes)
+    strip_count = strip_faces.shape[0]
     if strip_count == 0 or fragment_face.shape[0] == 0:
         for array in targets:
             array.zero_()
@@ -376,7 +378,7 @@ def shade_backward(
     launch(
         _strip_kernel(points.dtype),
         strip_count,
-        [window.rays(), *arguments, *grads, vectors(triangles.boxes), strip_ends, *sums],
+        [window.rays(), *arguments, *grads, vectors(triangles.boxes), strip_ends, strip_faces, *sums],
         device,
     )
     gather_corners(corners, strip_ends, sums, (to_points, to_rgba, to_thickness), points.dtype)

@@ -32,18 +32,30 @@ def count_strips(span: Span, boxes: wp.array[wp.vec4i], counts: wp.array[int]):
         counts[face] = (box[1] - box[0] + rows - 1) // rows
 
 
-@wp.func
-def first_at_least(sorted: wp.array[int], value: int) -> int:
-    """Return the first index whose entry is at least `value`, or the length."""
-    begin = int(0)
-    end = int(sorted.shape[0])
-    while begin < end:
-        middle = begin + (end - begin) // 2
-        if sorted[middle] < value:
-            begin = middle + 1
-        else:
-            end = middle
-    return begin
+@wp.kernel(module="unique", enable_backward=False)
+def number_strips(span: Span, strip_ends: wp.array[int], strip_faces: wp.array[int]):
+    """Write the triangle of each strip."""
+    for face in range(span.begin + wp.tid(), span.end, span.stride):
+        begin = int(0)
+        if face > 0:
+            begin = strip_ends[face - 1]
+        for strip in range(begin, strip_ends[face]):
+            strip_faces[strip] = face
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def find_begins(span: Span, sorted: wp.array[int], begins: wp.array[int]):
+    """Write where each value's run begins in sorted values; a value that does not occur has the next one's."""
+    for position in range(span.begin + wp.tid(), span.end, span.stride):
+        before = int(-1)
+        if position > 0:
+            before = sorted[position - 1]
+        last = sorted[position]
+        for value in range(before + 1, last + 1):
+            begins[value] = position
+        if position == sorted.shape[0] - 1:
+            for value in range(last + 1, begins.shape[0]):
+                begins[value] = position + 1
 
 
 @cache
@@ -51,7 +63,7 @@ def _gather_kernel(scalar: Any) -> wp.Kernel:
     @wp.kernel(module="unique", enable_backward=False)
     def gather(
         span: Span,
-        corner_vertices: wp.array(dtype=int),
+        vertex_begins: wp.array(dtype=int),
         corner_numbers: wp.array(dtype=int),
         strip_ends: wp.array(dtype=int),
         corner_points: wp.array2d(dtype=wp.vec3d),
@@ -65,8 +77,7 @@ def _gather_kernel(scalar: Any) -> wp.Kernel:
             sum_point = wp.vec3d()
             sum_rgba = wp.vec4d()
             sum_own = wp.float64(0.0)
-            position = first_at_least(corner_vertices, vertex)
-            while position < corner_vertices.shape[0] and corner_vertices[position] == vertex:
+            for position in range(vertex_begins[vertex], vertex_begins[vertex + 1]):
                 face = corner_numbers[position] // 3
                 corner = corner_numbers[position] - 3 * face
                 begin = int(0)
@@ -79,7 +90,6 @@ def _gather_kernel(scalar: Any) -> wp.Kernel:
                         sum_rgba += corner_rgba[strip, corner]
                     if corner_thickness.shape[0] > 0:
                         sum_own += corner_thickness[strip, corner]
-                position += 1
             if grad_points.shape[0] > 0:
                 for axis in range(3):
                     grad_points[vertex, axis] = scalar(sum_point[axis])
@@ -110,29 +120,35 @@ def gather_corners(
         target if target is not None else wp.empty((0,) * ndim, dtype=scalar, device=device)
         for target, ndim in zip(targets, (2, 2, 1), strict=True)
     ]
-    corner_vertices, corner_numbers = _corners_by_vertex(corners)
-    launch(_gather_kernel(scalar), vertex_count, [corner_vertices, corner_numbers, strip_ends, *sums, *wanted], device)
+    vertex_begins, corner_numbers = _corners_by_vertex(corners, vertex_count)
+    launch(_gather_kernel(scalar), vertex_count, [vertex_begins, corner_numbers, strip_ends, *sums, *wanted], device)
 
 
-def cut_strips(boxes: wp.array) -> tuple[wp.array, int]:
-    """Return where each triangle's strips end, counted over all triangles, and their number."""
-    counts = wp.empty(boxes.shape[0], dtype=int, device=boxes.device)
-    launch(count_strips, boxes.shape[0], [vectors(boxes), counts], boxes.device)
+def cut_strips(boxes: wp.array) -> tuple[wp.array, wp.array]:
+    """Return where each triangle's strips end, counted over all triangles, and the triangle of each strip."""
+    device = boxes.device
+    counts = wp.empty(boxes.shape[0], dtype=int, device=device)
+    launch(count_strips, boxes.shape[0], [vectors(boxes), counts], device)
     count = int(counts.numpy().sum(dtype=np.int64))
     if count > MOST_FRAGMENTS:
         raise ValueError(f"capture: {count} strips of triangles, expected at most {MOST_FRAGMENTS}")
     ends = wp.empty_like(counts)
+    faces = wp.empty(count, dtype=int, device=device)
     if counts.shape[0]:
         wp.utils.array_scan(counts, ends, inclusive=True)
-    return ends, count
+    launch(number_strips, boxes.shape[0], [ends, faces], device)
+    return ends, faces
 
 
-def _corners_by_vertex(corners: wp.array) -> tuple[wp.array, wp.array]:
-    """Return the vertex of each corner, sorted, and the corners' numbers 3·triangle + corner, ascending per vertex."""
-    count = corners.size
-    vertices = wp.empty(2 * count, dtype=int, device=corners.device)
-    numbers = wp.empty(2 * count, dtype=int, device=corners.device)
+def _corners_by_vertex(corners: wp.array, vertex_count: int) -> tuple[wp.array, wp.array]:
+    """Return where each vertex's corners begin in the list of their numbers, 3·triangle + corner, ascending per vertex."""
+    count, device = corners.size, corners.device
+    # The sort takes arrays of twice the length.
+    vertices = wp.empty(2 * count, dtype=int, device=device)
+    numbers = wp.empty(2 * count, dtype=int, device=device)
     wp.copy(vertices, corners.flatten(), count=count)
-    wp.copy(numbers, wp.array(np.arange(count, dtype=np.int32), device=corners.device))
+    wp.copy(numbers, wp.array(np.arange(count, dtype=np.int32), device=device), count=count)
     wp.utils.radix_sort_pairs(vertices, numbers, count)
-    return vertices[:count], numbers[:count]
+    begins = wp.empty(vertex_count + 1, dtype=int, device=device)
+    launch(find_begins, count, [vertices[:count], begins], device)
+    return begins, numbers

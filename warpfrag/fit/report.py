@@ -46,7 +46,8 @@ def draw_error(result: "FitResult", path: Path) -> None:
             axis.set_yticks([])
             bar = figure.colorbar(shown, cax=axis.inset_axes([1.02, 0.0, 0.04, 1.0]))
             bar.set_label(label)
-            bar.formatter.set_powerlimits((-2, 3))
+            # No power of ten above the bar: it would push one of the titles up.
+            bar.ax.yaxis.set_major_formatter(lambda value, position: f"{value:.2g}")
             bar.outline.set_linewidth(0.6)
         _save(figure, path)
 

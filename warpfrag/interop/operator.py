@@ -146,10 +146,11 @@ def _apply_warp(operator: Operator, inputs: Sequence[Any], options: Mapping[str,
                     add(array.grad, grad)
             # Consumed: left in place, a second backward pass over the tape would count them twice.
             for grad in grad_outputs:
-                if grad is not None:
+                if grad is not None and grad.size:
                     grad.zero_()
 
-        tape.record_func(backward, [a for a in (*inputs, *outputs) if a is not None and a.requires_grad])
+        # An empty array has no gradient that a tape could keep.
+        tape.record_func(backward, [a for a in (*inputs, *outputs) if a is not None and a.requires_grad and a.size])
     return outputs
 
 
