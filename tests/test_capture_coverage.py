@@ -1,5 +1,7 @@
 """Which pixels a triangle covers, and the order of the fragments there."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import warp as wp
@@ -7,7 +9,7 @@ from capture_scenes import orthographic, perspective, pixels_of, quad, rays_thro
 from scipy.spatial import Delaunay
 
 from warpfrag.capture.capture import capture
-from warpfrag.capture.raster import count_fragments, prepare_triangles, scan_counts
+from warpfrag.capture.raster import count_fragments, prepare_triangles, scan_counts, sort_fragments, store_fragments
 from warpfrag.capture.ray import Window
 from warpfrag.scene.primitives import sphere, torus
 
@@ -217,3 +219,21 @@ def test_arguments_are_checked():
             capture(setting, rows=rows)
     with pytest.raises(ValueError, match="memory_limit: got -1"):
         capture(setting, memory_limit=-1)
+
+
+def test_a_thread_per_triangle_stores_the_same_fragments(monkeypatch):
+    """The way of CUDA, a thread per triangle, gives the fragments that bands of rows give, once they are sorted."""
+    # One thread: on the CPU the counters that triangles share are not atomic.
+    monkeypatch.setenv("WARPFRAG_THREADS", "1")
+    item = soup(1, 60)
+    points = wp.array(item.vertices, device="cpu", dtype=wp.float32)
+    by_bands = prepare_triangles(points, wp.array(item.faces, device="cpu"), Window.of(perspective((40, 40))))
+    found = []
+    for triangles in (by_bands, replace(by_bands, listed=None, band_begins=None)):
+        offsets, total = scan_counts(count_fragments(triangles))
+        faces, depths = store_fragments(triangles, offsets, total, True)
+        sort_fragments(offsets, faces, depths)
+        found.append([array.numpy() for array in (offsets, faces, depths)])
+    assert found[0][0][-1] > 500
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, other)

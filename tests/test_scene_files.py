@@ -150,7 +150,7 @@ COMPLAINTS = {
     "ambient": (CAMERA + "[light]\nambient = -1\n" + BALL, "light.ambient: found -1"),
     "no shape": (
         CAMERA + '[[object]]\nname = "x"\n',
-        r'object\[0\] of "x": found no shape, expected mesh or primitive',
+        r'object\[0\] of "x": found no shape, expected mesh, primitive or points',
     ),
     "both": (CAMERA + BALL + 'mesh = "a.obj"\n', "found both mesh and primitive"),
     "primitive": (CAMERA + '[[object]]\nprimitive = "spere"\n', r'object\[0\].primitive: .*did you mean "sphere"\?'),

@@ -37,6 +37,12 @@ LOG_FLOOR = math.log(1.0e-6)
 LOG_OPAQUE = wp.constant(-1.0e30)
 # Below this opacity (1 - T^r)/A is summed as a series: the quotient would lose half of the digits of its derivative.
 SERIES_OPACITY = wp.constant(0.02)
+# What lets less than this through is opaque, and nothing is divided by less: in single precision derivatives of such
+# quotients would overflow.
+NEGLIGIBLE = wp.constant(1.0e-24)
+# The weight of a slab can triple whenever it is divided (all three parts of an opaque slab are opaque). Above this limit
+# no other slab has a say in a mix: there it stays, with no derivative, before it overflows.
+WEIGHT_LIMIT = wp.constant(1.0e12)
 
 
 @wp.struct
@@ -113,7 +119,7 @@ def log_transmittance(a: Any):
 @wp.func(inline=True)
 def divide(numerator: Any, denominator: Any, limit: Any):
     """Return the quotient, or its limit where both vanish."""
-    if denominator > type(denominator)(0.0):
+    if denominator > type(denominator)(NEGLIGIBLE):
         return numerator / denominator
     return limit
 
@@ -195,14 +201,20 @@ def over_adjoint(g: Any, a: Any, b: Any):
 
 
 @wp.func(inline=True)
+def per_length(s: Any):
+    """Return 1 / thickness."""
+    return type(s.z)(1.0) / wp.max(s.z - s.f, type(s.z)(NEGLIGIBLE))
+
+
+@wp.func(inline=True)
 def relative_lengths(a: Any, b: Any):
     """Return the lengths of the pieces relative to their slabs, a = [a0 | a1], b = [b0 | b1 | b2]; a0 = 0 or b0 = 0."""
     inner = wp.max(a.f, b.f)
-    per_b = type(inner)(1.0) / (b.z - b.f)
+    per_b = per_length(b)
     a0 = type(inner)(0.0)
     a1 = type(inner)(1.0)
     if a.f < b.f:
-        per_a = type(inner)(1.0) / (a.z - a.f)
+        per_a = per_length(a)
         a0 = (inner - a.f) * per_a
         a1 = (a.z - inner) * per_a
     return a0, a1, (inner - b.f) * per_b, (a.z - inner) * per_b, (b.z - a.z) * per_b
@@ -243,10 +255,14 @@ def optical_gain_adjoint(g: Any, a: Any, l: Any, r: Any, power: Any, floor: Any)
         return zero, zero, zero
     g_power = -g / a
     g_exponent = g_power * power
+    slope = wp.max(l, floor)
+    if slope <= type(g)(LOG_OPAQUE):
+        # Opaque from its front on, where that is does not matter.
+        slope = zero
     return (
         g_power * (type(g)(1.0) - power) / a,
         wp.where(l > floor, g_exponent * r, zero),
-        g_exponent * wp.max(l, floor),
+        g_exponent * slope,
     )
 
 
@@ -273,11 +289,13 @@ def mix_weights(a: Any, b: Any, x: Any, y: Any, d_a: Any, d_1: Any, d_2: Any, mi
         t_a = divide(a.t, d_a, zero)
         t_b = divide(d_2, d_1, zero)
         # Opaque parts win; two of them are averaged.
-        if t_a <= zero and t_b <= zero:
+        opaque_a = t_a <= type(x)(NEGLIGIBLE)
+        opaque_b = t_b <= type(x)(NEGLIGIBLE)
+        if opaque_a and opaque_b:
             return half, half, True
-        if t_a <= zero:
+        if opaque_a:
             return one, zero, True
-        if t_b <= zero:
+        if opaque_b:
             return zero, one, True
         return depth_per_opacity(a.a * x / d_a, t_a), depth_per_opacity(b.a * y / d_1, t_b), False
     return a.w, b.w, False
@@ -300,7 +318,7 @@ def merge(a: Any, b: Any, x: Any, y: Any, v: Any, mix: int):
         v_a, v_b, opaque = mix_weights(a, b, x, y, d_a, d_1, d_2, mix)
         total = d_1 * x_a * v_a + d_a * y_b * v_b
         scale = one
-        if total > zero and not opaque:
+        if total > type(x)(NEGLIGIBLE) and not opaque:
             scale = (d_1 * x_a + a.t * y_b) / total
         mixed_a = d_1 * x * v_a * scale
         mixed_b = d_a * y * v_b * scale
@@ -309,7 +327,7 @@ def merge(a: Any, b: Any, x: Any, y: Any, v: Any, mix: int):
     sum_a = one - x + divide(x, d_a, zero)
     sum_b = one - y - v + divide(y, d_1, zero) + divide(v, d_2, zero)
     opacity = a.a + a.t * b.a
-    weight = divide(a.a * a.w * sum_a + b.a * b.w * sum_b, opacity, one)
+    weight = wp.min(divide(a.a * a.w * sum_a + b.a * b.w * sum_b, opacity, one), type(x)(WEIGHT_LIMIT))
     c = share_a * a.c + share_b * b.c
     return slab(c, opacity, a.t * b.t, a.l + b.l, weight, wp.min(a.f, b.f), wp.max(a.z, b.z))
 
@@ -350,7 +368,7 @@ def merge_adjoint(g: Any, a: Any, b: Any, x: Any, y: Any, v: Any, mix: int):
         scale = one
         g_part = zero
         g_total = zero
-        if total > zero and not opaque:
+        if total > type(x)(NEGLIGIBLE) and not opaque:
             scale = (d_1 * x_a + a.t * y_b) / total
             g_part = (g_share_a * d_1 * x * v_a + g_share_b * d_a * y * v_b) / total
             g_total = -g_part * scale
@@ -371,12 +389,15 @@ def merge_adjoint(g: Any, a: Any, b: Any, x: Any, y: Any, v: Any, mix: int):
         elif not opaque:
             part_a, part_ta = depth_per_opacity_gradient(x_a / d_a, a.t / d_a)
             part_b, part_tb = depth_per_opacity_gradient(y_b / d_1, d_2 / d_1)
-            g_xa += g_va * part_a / d_a
-            g_at += g_va * part_ta / d_a
-            g_da -= g_va * (part_a * x_a + part_ta * a.t) / (d_a * d_a)
-            g_yb += g_vb * part_b / d_1
-            g_d1 -= g_vb * (part_b * y_b + part_tb * d_2) / (d_1 * d_1)
-            g_d2 = g_vb * part_tb / d_1
+            # Not over the square of d, which may underflow.
+            per_da = g_va / d_a
+            per_d1 = g_vb / d_1
+            g_xa += per_da * part_a
+            g_at += per_da * part_ta
+            g_da -= per_da * (part_a * (x_a / d_a) + part_ta * (a.t / d_a))
+            g_yb += per_d1 * part_b
+            g_d1 -= per_d1 * (part_b * (y_b / d_1) + part_tb * (d_2 / d_1))
+            g_d2 = per_d1 * part_tb
     # weight = (A_a w_a sum_a + A_b w_b sum_b) / opacity
     p = divide(x, d_a, zero)
     q = divide(y, d_1, zero)
@@ -385,7 +406,9 @@ def merge_adjoint(g: Any, a: Any, b: Any, x: Any, y: Any, v: Any, mix: int):
     sum_b = one - y - v + q + r
     opacity = a.a + a.t * b.a
     weight = divide(a.a * a.w * sum_a + b.a * b.w * sum_b, opacity, one)
-    g_sum = divide(g.w, opacity, zero)
+    g_sum = zero
+    if weight < type(x)(WEIGHT_LIMIT):
+        g_sum = divide(g.w, opacity, zero)
     g_opacity = g.a - g_sum * weight
     g_p = divide(g_sum * a.a * a.w, d_a, zero)
     g_q = divide(g_sum * b.a * b.w, d_1, zero)
@@ -457,8 +480,8 @@ def sfm_adjoint(g: Any, a: Any, b: Any, beta: Any, mix: int, floor: Any, front: 
     )
     back_a, back_l, g_r1 = optical_gain_adjoint(g_back, b.a, b.l, one - b2, back, floor)
     # Lengths: a0 and b0 reach from the first front to the inner one, a1 and b1 from there to a.z, b2 from a.z to b.z.
-    per_a = wp.where(a_first, one / (a.z - a.f), zero)
-    per_b = one / (b.z - b.f)
+    per_a = wp.where(a_first, per_length(a), zero)
+    per_b = per_length(b)
     g_a1 = beta * g_x
     g_b1 = beta * g_y
     g_b2 = beta * g_v - g_r1

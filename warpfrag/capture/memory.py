@@ -76,7 +76,7 @@ def fixed_bytes(triangles: Triangles, gradient: bool) -> int:
     seen = corner_count // 3 if triangles.listed is None else triangles.listed.shape[0]
     bytes = 16 * (corner_count // 3) + 4 * corner_count + 4 * seen
     if gradient:
-        bytes += STRIP_BYTES * seen + CORNER_SORT_BYTES * (corner_count // 3)
+        bytes += STRIP_BYTES * min(seen, corner_count // 3) + CORNER_SORT_BYTES * (corner_count // 3)
     return bytes
 
 

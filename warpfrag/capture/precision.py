@@ -126,9 +126,9 @@ def z_resolution(depth: Any, near: float, far: float, bits: int = DEPTH_BITS) ->
             raise TypeError(
                 f"depth: got {type(depth).__name__}, expected a number, torch.Tensor, wp.array or NumPy array"
             )
+        depth = float(depth)
         if not 0.0 <= depth < float("inf"):
             raise ValueError(f"depth: got {depth}, expected a finite number of at least 0")
-        depth = float(depth)
     elif dtype_name(depth) not in ("float32", "float64"):
         raise TypeError(f"depth: got dtype {dtype_name(depth)}, expected float32 or float64")
     if kind == "warp":

@@ -208,16 +208,14 @@ def _rasterize_kernel(scalar: Any) -> wp.Kernel:
 
 
 def _rasterize(triangles: Triangles, slots: wp.array, fragment_face: wp.array, fragment_depth: wp.array) -> None:
-    listed = triangles.listed
-    by_pixels = listed is not None
-    size = triangles.window.pixel_count if by_pixels else triangles.corners.shape[0]
-    if by_pixels and listed.shape[0] == 0:
-        return
     nothing = _nothing(int, triangles.device)
+    lists, size = (nothing, nothing), triangles.corners.shape[0]
+    by_pixels = triangles.listed is not None
+    if by_pixels:
+        lists, size = (triangles.listed, triangles.band_begins), triangles.window.pixel_count
     inputs = [
         *(int(by_pixels), vectors(triangles.points), vectors(triangles.corners), vectors(triangles.boxes)),
-        *(listed if by_pixels else nothing, triangles.band_begins if by_pixels else nothing, triangles.window.rays()),
-        *(slots, fragment_face, fragment_depth),
+        *(*lists, triangles.window.rays(), slots, fragment_face, fragment_depth),
     ]
     launch(_rasterize_kernel(triangles.points.dtype), size, inputs, triangles.device)
 

@@ -104,10 +104,12 @@ def _render_window(
         """Render rows from points, colours, thickness, maps and beta: arguments, as torch's checkpoints want them."""
         *arrays, band_beta = tensors
         band_surfaces = replace(surfaces, **dict(zip(("points", "rgba", "thickness", "maps"), arrays, strict=True)))
-        band_triangles = band_surfaces.triangles(replace(window, first_row=begin, row_count=end - begin))
-        starts, total = scan_counts(counts[begin * window.width : end * window.width])
-        fragments = fragments_of_rows(band_surfaces, band_triangles, starts, total, True)
-        return composite(fragments, _rows(band_beta, begin, end), **options)
+        # On the way back this runs again, outside of the caller's stream.
+        with band_surfaces.stream():
+            band_triangles = band_surfaces.triangles(replace(window, first_row=begin, row_count=end - begin))
+            starts, total = scan_counts(counts[begin * window.width : end * window.width])
+            fragments = fragments_of_rows(band_surfaces, band_triangles, starts, total, True)
+            return composite(fragments, _rows(band_beta, begin, end), **options)
 
     inputs = (surfaces.points, surfaces.rgba, surfaces.thickness, surfaces.maps, beta)
     bands = split_rows(row_counts, 0.0, fragment_size, allowed - fixed)

@@ -160,7 +160,7 @@ def shade_output_like(inputs: Sequence[Any], **options: Any) -> list[tuple[tuple
     return [((count, 4), "float"), ((count,), "float"), ((count,), "float"), ((count,), "int32"), ((count,), "int32")]
 
 
-def present(inputs: Sequence[wp.array | None]) -> list[wp.array]:
+def present(inputs: Sequence[Any]) -> list[wp.array]:
     """Return the inputs `SHADE_TENSORS` as kernels take them, with empty arrays in place of None: those are skipped."""
     points = inputs[0]
     kinds = {"maps": ((0, 0), points.dtype), "uv": ((0, 2), wp.float32), "texture_id": ((0,), wp.int32)}
@@ -174,7 +174,7 @@ def present(inputs: Sequence[wp.array | None]) -> list[wp.array]:
     return arrays
 
 
-def shade_forward(inputs: Sequence[wp.array | None], outputs: Sequence[wp.array], **options: Any) -> None:
+def shade_forward(inputs: Sequence[Any], outputs: Sequence[Any], **options: Any) -> None:
     """Shade the fragments: `inputs` are `SHADE_TENSORS`, `outputs` `SHADE_OUTPUTS`, `options` those of a `Window`."""
     points = inputs[0]
     if outputs[0].shape[0]:

@@ -341,9 +341,9 @@ def _maps_kernel(scalar: Any) -> wp.Kernel:
 
 
 def shade_backward(
-    inputs: Sequence[wp.array | None],
-    grad_outputs: Sequence[wp.array | None],
-    grad_inputs: Sequence[wp.array | None],
+    inputs: Sequence[Any],
+    grad_outputs: Sequence[Any],
+    grad_inputs: Sequence[Any],
     **options: Any,
 ) -> None:
     """Fill those gradients of `SHADE_TENSORS` that are not None, given those of `SHADE_OUTPUTS`."""

@@ -141,7 +141,7 @@ def cut_strips(boxes: wp.array) -> tuple[wp.array, wp.array]:
 
 
 def _corners_by_vertex(corners: wp.array, vertex_count: int) -> tuple[wp.array, wp.array]:
-    """Return where each vertex's corners begin in the list of their numbers, 3·triangle + corner, ascending per vertex."""
+    """Return where each vertex's corners begin in the list of their numbers, 3·triangle + corner, and that list."""
     count, device = corners.size, corners.device
     # The sort takes arrays of twice the length.
     vertices = wp.empty(2 * count, dtype=int, device=device)

@@ -222,12 +222,17 @@ def report_invalid(invalid: wp.array, inputs: Sequence[Any]) -> None:
         invalid: one row per thread: lowest invalid fragment, lowest pixel with an invalid beta.
         inputs: the operator's inputs, as `fragment_inputs` orders them.
     """
-    fragment, pixel = invalid.numpy().min(axis=0)
+    # As Python's own: NumPy's 32 bits would overflow in the address of an array's slice.
+    fragment, pixel = map(int, invalid.numpy().min(axis=0))
     if fragment != NO_FRAGMENT:
-        rgba, depth, thickness = (inputs[i][fragment : fragment + 1].numpy()[0] for i in range(3))
+        found = {
+            name: array[fragment : fragment + 1].numpy()[0].tolist()
+            for name, array in zip(FRAGMENT_TENSORS, inputs, strict=True)
+            if array is not None and name not in ("offsets", "beta")
+        }
         raise ValueError(
-            f"fragments: fragment {fragment} has rgba {tuple(map(float, rgba))}, depth {depth}, thickness {thickness}, "
-            "expected finite values, opacity from 0 to 1 and thickness of at least 0"
+            f"fragments: fragment {fragment} has {', '.join(f'{name} {value}' for name, value in found.items())}, "
+            "expected finite values, opacity from 0 to 1, thickness and opacity_sum of at least 0"
         )
     if pixel != NO_FRAGMENT:
         beta = inputs[4].numpy()[min(pixel, inputs[4].shape[0] - 1)]

@@ -14,8 +14,10 @@ from typing import Any
 import warp as wp
 
 from warpfrag.operators import (
+    WEIGHT_LIMIT,
     Slab32,
     Slab64,
+    divide,
     log_transmittance,
     ofm,
     ofm_adjoint,
@@ -170,8 +172,8 @@ def load_slab(pixels: Any, fragment: int, merge_kind: int):
     a = rgba[3]
     one = type(a)(1.0)
     weight = one
-    if pixels.opacity_sum.shape[0] > 0 and a > type(a)(0.0):
-        weight = pixels.opacity_sum[fragment] / a
+    if pixels.opacity_sum.shape[0] > 0:
+        weight = wp.min(divide(pixels.opacity_sum[fragment], a, one), type(a)(WEIGHT_LIMIT))
     log_t = type(a)(0.0)
     if merge_kind == MERGE_SMOOTH:
         # Nothing else reads it, and it costs a third of all the rest.
@@ -191,9 +193,9 @@ def store_grad(g: Any, pixels: Any, fragment: int, grads: Any):
         grad_a -= g.l / t
     if pixels.opacity_sum.shape[0] > 0:
         grad_sum = zero
-        if a > zero:
-            grad_sum = g.w / a
-            grad_a -= grad_sum * pixels.opacity_sum[fragment] / a
+        if divide(pixels.opacity_sum[fragment], a, zero) < type(a)(WEIGHT_LIMIT):
+            grad_sum = divide(g.w, a, zero)
+            grad_a -= divide(grad_sum * pixels.opacity_sum[fragment], a, zero)
         if grads.opacity_sum.shape[0] > 0:
             grads.opacity_sum[fragment] = grad_sum
     if grads.rgba.shape[0] > 0:
@@ -211,7 +213,12 @@ def valid_fragment(pixels: Any, fragment: int):
     t = pixels.thickness[fragment]
     zero = type(t)(0.0)
     # Zero times everything: one NaN or infinity anywhere makes the sum NaN.
-    sum = zero * (rgba[0] + rgba[1] + rgba[2] + pixels.depth[fragment] + t)
+    sum = zero * rgba[0] + zero * rgba[1] + zero * rgba[2] + zero * (pixels.depth[fragment] - t)
+    if pixels.opacity_sum.shape[0] > 0:
+        opacity_sum = pixels.opacity_sum[fragment]
+        sum += zero * opacity_sum
+        if opacity_sum < zero:
+            return False
     return sum == zero and rgba[3] >= zero and rgba[3] <= type(t)(1.0) and t >= zero
 
 

@@ -8,11 +8,13 @@ Top level: ``beta layers merge mix background`` and the tables ``[camera]``, ``[
 - ``[light]``: ``direction`` (towards the light, or ``"camera"``: from the eye, the default) and ``ambient`` (0.3). The
   colour of each vertex is multiplied by ambient + (1 − ambient)·|n·l|, once, when the file is read. Without the table
   all is unlit.
-- ``[[object]]``: ``name``; ``mesh`` (a path relative to the scene file, an absolute path, or ``"warp:<asset>"``) or
-  ``primitive`` with its sizes; ``translate``, ``rotate`` ({axis, degrees} or a list of them, in order), ``scale``,
-  applied scale first and translate last, or ``matrix`` (4 rows); ``color``, ``opacity``, ``thickness`` (a number, or
-  ``"2P"``: multiples of P(z), the default); ``texture`` (an image with sRGB colours, which ``color`` tints);
-  ``normals`` (``"smooth"`` or ``"flat"``).
+- ``[[object]]``: ``name``; ``mesh`` (a path relative to the scene file, an absolute path, or ``"warp:<asset>"``),
+  ``primitive`` with its sizes, or ``points`` (a ply, pts, pwn or xyz file), which become discs (surfels) of
+  ``segments`` (8) corners and of ``radius`` (2) times the points' mean distance to their nearest neighbours;
+  ``translate``, ``rotate`` ({axis, degrees} or a list of them, in order), ``scale``, applied scale first and translate
+  last, or ``matrix`` (4 rows); ``color``, ``opacity``, ``thickness`` (a number, or ``"2P"``: multiples of P(z), the
+  default; of points ``"10P"``); ``texture`` (an image with sRGB colours, which ``color`` tints); ``normals``
+  (``"smooth"`` or ``"flat"``). Points have neither texture nor ``normals``.
 
 A ``color`` replaces the file's colours and the colours of its images; an ``opacity`` replaces its alpha, but what an
 image cuts out (alpha 0) stays cut out.
@@ -33,6 +35,7 @@ from warpfrag.scene.errors import SceneError, shorten
 from warpfrag.scene.loading import GREY, load_mesh, warp_asset
 from warpfrag.scene.mesh import Mesh, lambert, smooth_normals, split_faces, transformed_normals
 from warpfrag.scene.objects import MERGES, MIXES, Scene, SceneObject
+from warpfrag.scene.points import load_points, surfels
 from warpfrag.scene.table import Table, is_number, is_numbers, number_words, read_toml
 
 _TOP = ("beta", "layers", "merge", "mix", "background", "camera", "light", "object")
@@ -48,8 +51,13 @@ _PRIMITIVES = {
     "plane": ("size",),
     "grid": ("size", "cells"),
 }
+# What a disc has no use for: it is flat, and has no texture coordinates.
+_POINTS = ("points", "radius", "segments", *(key for key in _OBJECT if key not in ("texture", "normals")))
+_SHAPES = ("mesh", "primitive", "points")
 # Beyond these a primitive is a slip of the keyboard: 4096 segments are 16 million triangles.
 _SEGMENTS, _CELLS, _PIXELS = 4096, 4096, 65536
+# Of each disc: more are not rounder at any size worth a disc.
+_DISC_SEGMENTS = 64
 _P = re.compile(r"\s*([0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)\s*P\s*")
 
 
@@ -122,14 +130,19 @@ def _object(
     path = f"object[{index}]"
     label = entry.get("name") if isinstance(entry, dict) else ""
     label = label if isinstance(label, str) else ""
-    every = ("mesh", "primitive", *_OBJECT, *sorted({key for keys in _PRIMITIVES.values() for key in keys}))
+    every = (*_SHAPES, *_OBJECT, *sorted({key for keys in _PRIMITIVES.values() for key in keys}))
     table = Table(entry, file, path, every, label)
-    if ("mesh" in table) == ("primitive" in table):
-        raise table.error("", "both mesh and primitive" if "mesh" in table else "no shape", "mesh or primitive")
+    shapes = [key for key in _SHAPES if key in table]
+    if len(shapes) != 1:
+        found = "both " + " and ".join(shapes) if shapes else "no shape"
+        raise table.error("", found, "mesh, primitive or points")
     if "primitive" in table:
         kind = str(table.choice("primitive", tuple(_PRIMITIVES)))
         Table(entry, file, path, ("primitive", *_OBJECT, *_PRIMITIVES[kind]), label, f'primitive "{kind}"')
         name, mesh = kind, _primitive(table, kind)
+    elif "points" in table:
+        Table(entry, file, path, _POINTS, label, "points")
+        name, mesh = _surfels(table, file)
     else:
         Table(entry, file, path, ("mesh", *_OBJECT), label, "a mesh")
         name, mesh = _mesh(table, file, meshes)
@@ -142,7 +155,8 @@ def _object(
     elif normals == "smooth" or mesh.normals is None:
         mesh = replace(mesh, normals=smooth_normals(mesh.vertices, mesh.faces))
     mesh = _look(table, file, mesh)
-    thickness, unit = _thickness(table)
+    # Discs of one surface overlap at angles to one another: the paper gives them more than its 2·P(z).
+    thickness, unit = _thickness(table, "10P" if "points" in table else "2P")
     color = np.full(3, 1.0 if mesh.textures else GREY) if mesh.color is None else mesh.color
     try:
         item = SceneObject(
@@ -179,6 +193,19 @@ def _mesh(table: Table, file: Path, meshes: dict[tuple, Mesh]) -> tuple[str, Mes
     except ImportError as error:
         raise ImportError(f"{file}: {table.path}.mesh: {error}") from error
     return path.stem, meshes[key]
+
+
+def _surfels(table: Table, file: Path) -> tuple[str, Mesh]:
+    path, _ = _inside(table, "points", str(table.text("points")), file)
+    sizes: dict[str, Any] = {"radius": table.number("radius", above=0.0)}
+    sizes["segments"] = table.integer("segments", 3, _DISC_SEGMENTS)
+    try:
+        mesh = surfels(load_points(path), **{key: value for key, value in sizes.items() if value is not None})
+    except ValueError as error:
+        raise table.wrap("points", error) from error
+    except ImportError as error:
+        raise ImportError(f"{file}: {table.path}.points: {error}") from error
+    return path.stem, mesh
 
 
 def _inside(table: Table, key: str, text: str, file: Path) -> tuple[Path, Path | None]:
@@ -289,8 +316,8 @@ def _image(table: Table, file: Path) -> np.ndarray:
         raise table.error("texture", f"an image that cannot be read: {path}", "a PNG, JPEG or other image") from error
 
 
-def _thickness(table: Table) -> tuple[float, Any]:
-    value = table.data.get("thickness", "2P")
+def _thickness(table: Table, default: str) -> tuple[float, Any]:
+    value = table.data.get("thickness", default)
     match = _P.fullmatch(value) if isinstance(value, str) else None
     if match is not None and np.isfinite(float(match[1])):
         return float(match[1]), "P"
