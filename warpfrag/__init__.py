@@ -11,6 +11,8 @@ image, and every step can be differentiated, on the CPU and on CUDA from the sam
 from an image. Arrays may be torch tensors, Warp arrays or NumPy arrays: what goes in comes out.
 """
 
+from warpfrag import baselines
+from warpfrag.absorbance import Absorbance, absorbance
 from warpfrag.capture.capture import capture
 from warpfrag.capture.precision import z_resolution
 from warpfrag.capture.render import render
@@ -23,6 +25,7 @@ from warpfrag.scene import Camera, Scene, SceneError, SceneObject, load_scene
 __version__ = "0.1.0"
 
 __all__ = [
+    "Absorbance",
     "Camera",
     "FitError",
     "FitResult",
@@ -33,6 +36,8 @@ __all__ = [
     "SceneObject",
     "Study",
     "StudyError",
+    "absorbance",
+    "baselines",
     "capture",
     "composite",
     "fit",

@@ -10,7 +10,7 @@ from warpfrag.fragments import Fragments
 
 
 def exact_image(fragments: Fragments) -> Any:
-    """Return the image of plain sorted over, (H, W, 4), and with it the exact opacity; checks every value on the way."""
+    """Return the image of plain sorted over, (H, W, 4), for its exact opacity; checks every value on the way."""
     if not isinstance(fragments, Fragments):
         raise TypeError(f"fragments: got {type(fragments).__name__}, expected Fragments")
     return composite(fragments, merge="none")
@@ -23,7 +23,9 @@ def array_module(fragments: Fragments) -> Any:
         TypeError: they are Warp arrays, for which the method is not written.
     """
     if fragments.kind == "warp":
-        raise TypeError("fragments: got Warp arrays, expected NumPy or torch (`fragments.numpy()`, `fragments.torch()`)")
+        raise TypeError(
+            "fragments: got Warp arrays, expected NumPy or torch (`fragments.numpy()`, `fragments.torch()`)"
+        )
     if fragments.kind == "numpy":
         return np
     import torch

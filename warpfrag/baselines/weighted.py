@@ -1,6 +1,6 @@
 """Weighted blended order-independent transparency (McGuire and Bavoil, JCGT 2(2), 2013).
 
-Colours are averaged with weights that fall off with depth, in place of being sorted (eq. 6):
+Colours are averaged with weights that fall off with depth, in place of being sorted:
 
     C = A * sum_i C_i w_i / sum_i A_i w_i,   A = 1 - prod_i (1 - A_i)      (C_i premultiplied)
 
@@ -18,9 +18,6 @@ from typing import Any, Literal
 
 from warpfrag.baselines.inputs import array_module, exact_image, owners, range_of_depths, ratio, sum_pixels
 from warpfrag.fragments import Fragments
-from warpfrag.resolve.arguments import check_choice
-
-_EQUATIONS = (7, 8, 9, 10)
 
 
 def weighted_blended(
@@ -29,7 +26,7 @@ def weighted_blended(
     equation: Literal[7, 8, 9, 10] = 7,
     depth_range: tuple[float, float] | None = None,
 ) -> Any:
-    """Average the fragments of each pixel with weights that depend on depth (McGuire and Bavoil 2013, eq. 6).
+    """Average the fragments of each pixel with weights that depend on depth (McGuire and Bavoil 2013).
 
     Exact for one fragment, and for any number of equal colour; its opacity always is. Differentiable in colour, opacity
     and depth.
@@ -46,7 +43,8 @@ def weighted_blended(
         TypeError: the fragments are Warp arrays.
         ValueError: an option does not exist, or values are not finite or out of range.
     """
-    check_choice("equation", equation, _EQUATIONS)
+    if equation not in (7, 8, 9, 10):
+        raise ValueError(f"equation: got {equation!r}, expected 7, 8, 9 or 10")
     xp = array_module(fragments)
     opacity = exact_image(fragments)[..., 3:]
     near, far = range_of_depths(fragments, depth_range) if equation == 10 else (0.0, 0.0)
@@ -65,6 +63,6 @@ def _falloff(xp: Any, depth: Any, equation: int, near: float, far: float) -> Any
         return xp.clip(10.0 / (1e-5 + (z / 10.0) ** 3 + (z / 200.0) ** 6), 1e-2, 3e3)
     if equation == 9:
         return xp.clip(0.03 / (1e-5 + (z / 200.0) ** 4), 1e-2, 3e3)
-    # Depth in the window of a perspective camera (eq. 11), 1 - d; all at the same depth are at its front.
+    # Depth in the window of a perspective camera, 1 - d; all at the same depth are at its front.
     clear = (near / xp.clip(depth, near, far) - near / far) / (1.0 - near / far) if far > near else 1.0 + 0.0 * depth
     return xp.clip(3e3 * clear**3, 1e-2, 3e3)

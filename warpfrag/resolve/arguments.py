@@ -137,7 +137,8 @@ class Walk:
             self.pixels.opacity_sum = opacity_sum
         self.pixels.floor = LOG_OPAQUE if mix == "optical_depth" else LOG_FLOOR
         self.pixels.max_layers = max_layers
-        self.choice = (self.scalar, MERGES[merge], MIXES[mix])
+        # Without merging nothing is mixed: one kernel serves every mix.
+        self.choice = (self.scalar, MERGES[merge], MIXES[mix if merge != "none" else "opacity"])
 
     def optional(self, array: wp.array | None, ndim: int) -> wp.array:
         """Return the array, or an empty one in place of None: kernels skip those."""

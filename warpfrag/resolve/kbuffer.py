@@ -103,21 +103,122 @@ def _forward_kernel(scalar: Any, merging: int) -> wp.Kernel:
 
 
 @wp.func(inline=True)
-def slot_of(parent: wp.array[wp.int32], base: int, number: int):
-    """Return the slot that a fragment ended in, or -1 if it was dropped; shortens its path for the next."""
+def layer_of(parent: wp.array[wp.int32], number: int):
+    """Return the layer that a fragment ended in, or -1 if it was dropped; shortens the paths of those that follow."""
     at = int(number)
-    above = parent[base + at]
+    above = int(parent[at])
     while above >= 0:
-        next = parent[base + above]
+        next = parent[above]
         if next >= 0:
-            parent[base + at] = next
+            parent[at] = next
         at = above
         above = next
-    return OWNS_SLOT - above if above != DROPPED else -1
+    layer = int(-1)
+    if above != DROPPED:
+        layer = OWNS_SLOT - above
+    return layer
+
+
+@wp.func(inline=True)
+def load_member(pixels: Any, fragment: int):
+    """Return colour and opacity, opacity sum and weight of a fragment, in double precision."""
+    rgba = wp.vec4d(pixels.rgba[fragment])
+    s = rgba[3]
+    weight = ONE
+    if pixels.opacity_sum.shape[0] > 0:
+        s = wp.float64(pixels.opacity_sum[fragment])
+        if rgba[3] > ZERO:
+            weight = s / rgba[3]
+    return rgba, s, weight
+
+
+@wp.func(inline=True)
+def front_of(pixels: Any, fragment: int, merging: int):
+    """Return where a fragment begins, in the precision in which it was streamed."""
+    front = pixels.depth[fragment]
+    if merging != 0:
+        front = front - pixels.thickness[fragment]
+    return front
+
+
+@wp.func(inline=True)
+def with_member(m: Members, pixels: Any, fragment: int, merging: int):
+    """Return the sums with one member more."""
+    rgba, s, weight = load_member(pixels, fragment)
+    sum = Members()
+    sum.color = m.color + weight * wp.vec3d(rgba[0], rgba[1], rgba[2])
+    sum.opacity = m.opacity + (ONE - m.opacity) * rgba[3]
+    sum.excess = m.excess + m.opacity * rgba[3]
+    sum.opacity_sum = m.opacity_sum + s
+    sum.through = m.through
+    sum.opaque = m.opaque
+    if rgba[3] < ONE:
+        sum.through = m.through * (ONE - rgba[3])
+    else:
+        sum.opaque = m.opaque + 1
+    sum.back = m.back
+    if m.back < 0 or pixels.depth[fragment] > pixels.depth[m.back]:
+        sum.back = fragment
+    sum.front = m.front
+    if m.front < 0 or front_of(pixels, fragment, merging) < front_of(pixels, m.front, merging):
+        sum.front = fragment
+    return sum
+
+
+@wp.func(inline=True)
+def no_members():
+    """Return the sums over nothing."""
+    m = Members()
+    m.through = ONE
+    m.back = -1
+    m.front = -1
+    return m
+
+
+@wp.func(inline=True)
+def rest_of(m: Members, opacity: wp.float64):
+    """Return the transmittance of all members but one of this opacity, and 1 minus that."""
+    rest = ZERO
+    if opacity < ONE:
+        if m.opaque == 0:
+            rest = m.through / (ONE - opacity)
+            return rest, wp.max(m.opacity - opacity, ZERO) / (ONE - opacity)
+    elif m.opaque == 1:
+        rest = m.through
+    return rest, ONE - rest
+
+
+@wp.func(inline=True)
+def member_adjoint(m: Members, g: wp.vec4d, g_sum: wp.float64, pixels: Any, fragment: int):
+    """Return a member's gradients in colour and opacity and in the opacity sum, given those of the layer."""
+    rgba, s, weight = load_member(pixels, fragment)
+    g_color = wp.vec3d(g[0], g[1], g[2])
+    rest, rest_opacity = rest_of(m, rgba[3])
+    g_opacity = g[3] * rest
+    g_own_sum = g_sum
+    scale = ONE
+    if m.opacity_sum > ZERO and m.opacity > ZERO:
+        scale = m.opacity / m.opacity_sum
+        along = wp.dot(g_color, m.color)
+        if pixels.opacity_sum.shape[0] > 0:
+            g_opacity += along * rest / m.opacity_sum
+            g_own_sum -= along * scale / m.opacity_sum
+            if rgba[3] > ZERO:
+                own = scale * wp.dot(g_color, wp.vec3d(rgba[0], rgba[1], rgba[2])) / rgba[3]
+                g_own_sum += own
+                g_opacity -= own * weight
+        else:
+            g_opacity += along * (m.excess / m.opacity_sum - rest_opacity) / m.opacity_sum
+    if pixels.opacity_sum.shape[0] == 0:
+        g_opacity += g_sum
+    g_color = scale * weight * g_color
+    return wp.vec4d(g_color[0], g_color[1], g_color[2], g_opacity), g_own_sum
 
 
 @cache
 def _backward_kernel(scalar: Any, merging: int) -> wp.Kernel:
+    vec4 = wp.types.vector(4, scalar)
+
     @wp.kernel(module="unique", enable_backward=False)
     def kbuffer_bwd(
         span: Span,
@@ -132,8 +233,194 @@ def _backward_kernel(scalar: Any, merging: int) -> wp.Kernel:
         grads: GRADIENTS[scalar],
     ):
         row = span.worker + wp.tid()
-        base = row * length
         for pixel in range(span.begin + wp.tid(), span.end, span.stride):
-            pass
+            begin = pixels.offsets[pixel]
+            end = pixels.offsets[pixel + 1]
+            # The numbers of the pixel's fragments in the thread's part of `parent`.
+            shift = row * length - begin
+            slots.count[row] = 0
+            for fragment in range(begin, end):
+                stream_fragment(slots, row, shift + fragment, pixels, fragment, merging)
+            layer_count = slots.count[row]
+            if layer_count >= TAIL_IN_USE:
+                layer_count -= TAIL_IN_USE
+                slots.parent[slots.owner[row, slots.core]] = OWNS_SLOT - layer_count
+                for slot in range(layer_count):
+                    slots.parent[slots.owner[row, slot]] = OWNS_SLOT - slot
+                layer_count += 1
+            else:
+                for slot in range(layer_count):
+                    slots.parent[slots.owner[row, slot]] = OWNS_SLOT - slot
+            for layer in range(layer_count):
+                members[row, layer] = no_members()
+            for fragment in range(begin, end):
+                layer = layer_of(slots.parent, shift + fragment)
+                if layer >= 0:
+                    members[row, layer] = with_member(members[row, layer], pixels, fragment, merging)
+            for fragment in range(begin, end):
+                layer = layer_of(slots.parent, shift + fragment)
+                to_rgba = wp.vec4d()
+                to_sum = ZERO
+                to_depth = scalar(0.0)
+                to_thickness = scalar(0.0)
+                if layer >= 0:
+                    m = members[row, layer]
+                    g = wp.vec4d()
+                    if grad_rgba.shape[0] > 0:
+                        g = wp.vec4d(
+                            wp.float64(grad_rgba[pixel, layer, 0]),
+                            wp.float64(grad_rgba[pixel, layer, 1]),
+                            wp.float64(grad_rgba[pixel, layer, 2]),
+                            wp.float64(grad_rgba[pixel, layer, 3]),
+                        )
+                    g_sum = ZERO
+                    if grad_opacity_sum.shape[0] > 0:
+                        g_sum = wp.float64(grad_opacity_sum[pixel, layer])
+                    to_rgba, to_sum = member_adjoint(m, g, g_sum, pixels, fragment)
+                    if m.back == fragment and grad_depth.shape[0] > 0:
+                        to_depth += grad_depth[pixel, layer]
+                    if grad_thickness.shape[0] > 0:
+                        if m.back == fragment:
+                            to_depth += grad_thickness[pixel, layer]
+                        if m.front == fragment:
+                            to_depth -= grad_thickness[pixel, layer]
+                            if merging != 0:
+                                to_thickness = grad_thickness[pixel, layer]
+                if grads.rgba.shape[0] > 0:
+                    grads.rgba[fragment] = vec4(to_rgba)
+                if grads.depth.shape[0] > 0:
+                    grads.depth[fragment] = to_depth
+                if grads.thickness.shape[0] > 0:
+                    grads.thickness[fragment] = to_thickness
+                if grads.opacity_sum.shape[0] > 0:
+                    grads.opacity_sum[fragment] = scalar(to_sum)
 
     return kbuffer_bwd
+
+
+def _pixels(inputs: Sequence[Any]) -> Any:
+    rgba, depth, thickness, offsets, opacity_sum = inputs
+    pixels = PIXELS[rgba.dtype]()
+    pixels.rgba, pixels.depth, pixels.thickness, pixels.offsets = vectors(rgba), depth, thickness, offsets
+    if opacity_sum is not None:
+        pixels.opacity_sum = opacity_sum
+    return pixels
+
+
+def _output_like(inputs: Sequence[Any], slots: int, merge: str, tail: str) -> list[tuple[tuple[int, ...], str]]:
+    return layers_like(inputs[3].shape[0] - 1, slots)
+
+
+def layers_like(pixel_count: int, slots: int) -> list[tuple[tuple[int, ...], str]]:
+    """Return the shapes and kinds of `LAYER_OUTPUTS`."""
+    per_slot = ((pixel_count, slots), "float")
+    return [((pixel_count, slots, 4), "float"), per_slot, per_slot, per_slot, ((pixel_count,), "int32")]
+
+
+def _forward(inputs: Sequence[Any], outputs: Sequence[Any], slots: int, merge: str, tail: str) -> None:
+    device, offsets = inputs[0].device, inputs[3]
+    longest_list(offsets, inputs[0].shape[0])
+    pixel_count = offsets.shape[0] - 1
+    rows = worker_count(pixel_count, device, 0)
+    invalid = wp.array(np.full((rows, 2), NO_FRAGMENT, np.int32), device=device)
+    kernel = _forward_kernel(inputs[0].dtype, int(merge != "none"))
+    launch(kernel, pixel_count, [_pixels(inputs), slots_in(*outputs, tail=tail), invalid], device, rows)
+    report_invalid(invalid, inputs)
+
+
+def kbuffer_backward(
+    inputs: Sequence[Any], grad_outputs: Sequence[Any], grad_inputs: Sequence[Any], slots: int, merge: str, tail: str
+) -> None:
+    """Fill those gradients of the fragments that are not None, given those of the layers."""
+    rgba, _, _, offsets, _ = inputs
+    scalar, device, pixel_count = rgba.dtype, rgba.device, offsets.shape[0] - 1
+    length = max(1, longest_list(offsets, rgba.shape[0]))
+    rows = worker_count(pixel_count, device, 4 * length + slots * (7 * wp.types.type_size_in_bytes(scalar) + 92))
+    sizes = zip(LAYER_OUTPUTS, layers_like(rows, slots), strict=True)
+    scratch = slots_in(
+        *(wp.empty(shape, dtype=scalar if kind == "float" else int, device=device) for _, (shape, kind) in sizes),
+        tail=tail,
+    )
+    scratch.owner = wp.empty((rows, slots), dtype=int, device=device)
+    scratch.parent = wp.empty(rows * length, dtype=int, device=device)
+    members = wp.empty((rows, slots), dtype=Members, device=device)
+    targets = GRADIENTS[scalar]()
+    grad_rgba, grad_depth, grad_thickness, _, grad_opacity_sum = grad_inputs
+    if grad_rgba is not None:
+        targets.rgba = vectors(grad_rgba)
+    if grad_depth is not None:
+        targets.depth = grad_depth
+    if grad_thickness is not None:
+        targets.thickness = grad_thickness
+    if grad_opacity_sum is not None:
+        targets.opacity_sum = grad_opacity_sum
+    grads = [
+        grad if grad is not None else wp.empty((0,) * ndim, dtype=scalar, device=device)
+        for grad, ndim in zip(grad_outputs[:4], (3, 2, 2, 2), strict=True)
+    ]
+    arguments = [_pixels(inputs), scratch, length, members, *grads, targets]
+    launch(_backward_kernel(scalar, int(merge != "none")), pixel_count, arguments, device, rows)
+
+
+_KBUFFER = Operator(
+    name="kbuffer",
+    tensors=("rgba", "depth", "thickness", "offsets", "opacity_sum"),
+    differentiable=("rgba", "depth", "thickness", "opacity_sum"),
+    outputs=LAYER_OUTPUTS,
+    output_like=_output_like,
+    forward=_forward,
+    backward=kbuffer_backward,
+    options=KBUFFER_OPTIONS,
+)
+
+
+def kbuffer(
+    fragments: Fragments, slots: int = 8, *, merge: KMerge = "order_independent", tail: Tail = "mix"
+) -> Layers:
+    """Stream the fragments of every pixel, in the order in which they are given, into a k-buffer.
+
+    This is what a renderer that cannot store all fragments would make of them (SKB, with merging SKB+OFM): it merges
+    without regard to depth, and once all slots are taken the farthest mix in the last. As long as that tail stays empty
+    the order makes no difference. `capture(..., sort=False)` gives fragments in order of submission; `capture_kbuffer`
+    captures a scene like this, without ever storing them.
+
+    Differentiable in the fragments' colour, opacity, depth, thickness and opacity sum; which fragments share a slot,
+    and which are dropped, is held fixed.
+
+    Args:
+        fragments: what to stream.
+        slots: number K of slots of each pixel.
+        merge: "order_independent" mixes what overlaps (OFM); "none" is the plain k-buffer, in which every thickness
+            counts as 0.
+        tail: what happens beyond the slots: "mix" keeps the last slot for all that lies behind the others, mixed;
+            "discard" drops it, which without merging leaves the K nearest fragments.
+
+    Returns:
+        The layers (K per pixel), in the kind and precision of the fragments' arrays.
+
+    Raises:
+        TypeError: an argument is of the wrong type.
+        ValueError: an option does not exist, or values are not finite or out of range.
+
+    Example:
+        >>> fragments = wf.capture(wf.load_scene("scenes/three_spheres.toml"), sort=False)
+        >>> wf.kbuffer(fragments, slots=4).depth.shape
+        (512, 512, 4)
+    """
+    if not isinstance(fragments, Fragments):
+        raise TypeError(f"fragments: got {type(fragments).__name__}, expected Fragments")
+    check_kbuffer(slots, merge, tail)
+    inputs = (fragments.rgba, fragments.depth, fragments.thickness, as_int32(fragments.offsets), fragments.opacity_sum)
+    return as_layers(apply(_KBUFFER, inputs, slots=int(slots), merge=merge, tail=tail), fragments.shape, slots)
+
+
+def as_layers(outputs: Sequence[Any], grid: tuple[int, ...], slots: int) -> Layers:
+    """Return `LAYER_OUTPUTS` of all pixels in one row as the layers of a pixel grid."""
+    rgba, depth, thickness, opacity_sum, count = outputs
+    return Layers(
+        rgba.reshape((*grid, slots, 4)),
+        depth.reshape((*grid, slots)),
+        thickness.reshape((*grid, slots)),
+        opacity_sum.reshape((*grid, slots)),
+        count.reshape(grid),
+    )

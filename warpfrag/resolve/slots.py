@@ -74,7 +74,10 @@ def slots_in(
     """Return the slots that live in the arrays of layers, (P, K, 4), (P, K) and (P,)."""
     slots = SLOTS[depth.dtype]()
     vec4 = wp.types.vector(4, depth.dtype)
-    slots.rgba = wp.array(ptr=rgba.ptr, dtype=vec4, shape=depth.shape, device=depth.device)
+    view = wp.array(ptr=rgba.ptr, dtype=vec4, shape=depth.shape, device=depth.device)
+    # A view by address does not keep its memory alive by itself.
+    view._ref = rgba
+    slots.rgba = view
     slots.depth, slots.front, slots.opacity_sum, slots.count = depth, front, opacity_sum, count
     slots.tail = int(tail == "mix")
     slots.core = depth.shape[1] - slots.tail
