@@ -58,9 +58,7 @@ def torch_gradients(
     """
     import torch
 
-    fragments = fragments_of(
-        pixels, dtype, kind="torch", device=device, opacity_sum=opacity_sum, requires_grad=True
-    )
+    fragments = fragments_of(pixels, dtype, kind="torch", device=device, opacity_sum=opacity_sum, requires_grad=True)
     beta = np.broadcast_to(beta, (1, len(pixels.offsets) - 1))
     beta = array_of(beta, dtype, "torch", device, requires_grad=True)
     outputs = function(fragments, beta)

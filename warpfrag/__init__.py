@@ -14,11 +14,13 @@ from an image. Arrays may be torch tensors, Warp arrays or NumPy arrays: what go
 from warpfrag import baselines
 from warpfrag.absorbance import Absorbance, absorbance
 from warpfrag.capture.capture import capture
+from warpfrag.capture.kbuffer import Culling, capture_kbuffer, count_culled
 from warpfrag.capture.precision import z_resolution
 from warpfrag.capture.render import render
 from warpfrag.composite import composite
 from warpfrag.fit import FitError, FitResult, Study, StudyError, fit, load_study
 from warpfrag.fragments import Fragments, Layers
+from warpfrag.resolve.kbuffer import kbuffer
 from warpfrag.resolve.smooth import resolve
 from warpfrag.scene import Camera, Scene, SceneError, SceneObject, load_scene
 
@@ -27,6 +29,7 @@ __version__ = "0.1.0"
 __all__ = [
     "Absorbance",
     "Camera",
+    "Culling",
     "FitError",
     "FitResult",
     "Fragments",
@@ -39,8 +42,11 @@ __all__ = [
     "absorbance",
     "baselines",
     "capture",
+    "capture_kbuffer",
     "composite",
+    "count_culled",
     "fit",
+    "kbuffer",
     "load_scene",
     "load_study",
     "render",

@@ -21,7 +21,7 @@ from warpfrag.resolve.smooth import resolve
 
 # Least transmittance of a slab that is divided, and the number of intervals that draw the curve inside of one.
 _FLOOR = 1e-6
-_INTERVALS = 16
+_INTERVALS = 32
 
 
 @dataclass(frozen=True, eq=False)

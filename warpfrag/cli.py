@@ -1,4 +1,4 @@
-"""The command line: `warpfrag render` and `warpfrag fit`.
+"""The command line: `warpfrag render`, `warpfrag fit` and `warpfrag inspect`.
 
 Whatever goes wrong is one line on standard error and exit status 2; Ctrl-C is 130. `WARPFRAG_TRACEBACK=1` lets Python's
 traceback through. Everything heavy is imported by the command that needs it, so that `--help` is quick.
@@ -27,6 +27,7 @@ app = typer.Typer(
 )
 
 _SIZE = re.compile(r"(\d{1,5})[xX×](\d{1,5})")
+_PIXEL = re.compile(r"(\d{1,5})\s*,\s*(\d{1,5})")
 _P = re.compile(r"\s*([0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)\s*P\s*")
 
 SizeOption = Annotated[str | None, typer.Option("--size", metavar="WxH", help="Width and height in pixels.")]
@@ -177,6 +178,51 @@ def fit(
     for line in result.lines():
         print(line)
     print(f"results in {folder}")
+
+
+@app.command()
+def inspect(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="The scene.", show_default=False)],
+    pixel: Annotated[str, typer.Option("--pixel", metavar="X,Y", help="Column and row, from the top left, 0 first.")],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="FILE.png", help="The plot [SCENE_X_Y.png].")
+    ] = None,
+    beta: Annotated[float | None, typer.Option(help="In-slab interpolation, 0 (optical) to 1 (linear).")] = None,
+    layers: Annotated[int | None, typer.Option(help="Largest number of layers of a pixel.")] = None,
+    merge: Annotated[str | None, typer.Option(help="none, smooth, order_independent or exact.")] = None,
+    mix: Annotated[str | None, typer.Option(help="opacity, average or optical_depth.")] = None,
+    size: SizeOption = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="Any parameter, such as ball.opacity=0.5; may be repeated."),
+    ] = None,
+) -> None:
+    """List the fragments of one pixel, and draw them with the absorbance along its ray, before and after merging."""
+    _quiet()
+    from warpfrag.images import check_target
+    from warpfrag.inspect import inspect_pixel
+    from warpfrag.scene.files import load_scene
+
+    match = _PIXEL.fullmatch(pixel.strip())
+    if match is None:
+        raise UsageError(f"--pixel: found {pixel!r}, expected column and row such as 320,240")
+    column, row = int(match[1]), int(match[2])
+    target = output if output is not None else Path(f"{scene.stem}_{column}_{row}.png")
+    if target.suffix.lower() != ".png":
+        raise UsageError(f"{target}: found the suffix {target.suffix or '(none)'}, expected .png")
+    check_target(target)
+    wanted = load_scene(scene)
+    for setting in settings or []:
+        wanted = _set(wanted, setting)
+    changes: dict[str, Any] = {"beta": beta, "layers": layers, "merge": merge, "mix": mix}
+    changes = {key: value for key, value in changes.items() if value is not None}
+    if size is not None:
+        changes["camera"] = wanted.camera.resized(_parse_size(size))
+    inspection = inspect_pixel(replace(wanted, **changes), column, row)
+    inspection.draw(target)
+    for line in inspection.lines():
+        print(line)
+    print(f"plot in {target}")
 
 
 def _parse_size(text: str) -> tuple[int, int]:

@@ -34,6 +34,7 @@ from warpfrag.resolve.arguments import (
     fragment_inputs,
     vectors,
 )
+from warpfrag.resolve.exact import COMPOSITE_EXACT, apply_exact
 from warpfrag.resolve.walk import (
     STEP_START,
     choose_step,
@@ -407,7 +408,10 @@ def composite(
         return image.reshape((*source.shape, 4))
     defaults: dict[str, Any] = {"beta": 1.0, "max_layers": 8, "merge": "smooth", "mix": "opacity"}
     chosen = {name: default if given[name] is None else given[name] for name, default in defaults.items()}
-    inputs = fragment_inputs(source, chosen.pop("beta"))
+    chosen_beta = chosen.pop("beta")
     check_options(**chosen)
-    (image,) = apply(_COMPOSITE_FRAGMENTS, inputs, **chosen)
+    if chosen["merge"] == "exact":
+        (image,) = apply_exact(COMPOSITE_EXACT, source, chosen_beta, dimensions=1, mix=chosen["mix"])
+    else:
+        (image,) = apply(_COMPOSITE_FRAGMENTS, fragment_inputs(source, chosen_beta, dimensions=1), **chosen)
     return image.reshape((*source.shape, 4))

@@ -44,8 +44,8 @@ class Fragments:
         object.__setattr__(self, "shape", _grid(self.shape))
         floats = {n: getattr(self, n) for n in ("rgba", "depth", "thickness", "opacity_sum")}
         integers = {n: getattr(self, n) for n in ("offsets", "object_id", "primitive_id")}
-        _check_arrays(floats, integers)
-        count = self.rgba.shape[0]
+        _check_arrays(floats, integers, optional=("opacity_sum", "object_id", "primitive_id"))
+        count = self.rgba.shape[0] if self.rgba.shape else "F"
         expected = {"rgba": (count, 4), "offsets": (math.prod(self.shape) + 1,)}
         for name, array in {**floats, **integers}.items():
             _check_shape(name, array, expected.get(name, (count,)))
@@ -81,7 +81,17 @@ class Fragments:
             pixels: for each pixel in row-major order its fragments; colours are premultiplied.
             shape: the pixel grid.
             dtype: np.float32 or np.float64.
+
+        Raises:
+            ValueError: a fragment has not six values, or there are more or fewer lists than pixels.
         """
+        for number, pixel in enumerate(pixels):
+            for fragment in pixel:
+                if len(fragment) != 6:
+                    raise ValueError(
+                        f"pixels: pixel {number} has a fragment of {len(fragment)} values, expected 6: "
+                        "r, g, b, opacity, depth, thickness"
+                    )
         rows = np.array([fragment for pixel in pixels for fragment in pixel], dtype).reshape(-1, 6)
         offsets = np.concatenate([[0], np.cumsum([len(pixel) for pixel in pixels])]).astype(np.int32)
         rgba, depth, thickness = (np.ascontiguousarray(a) for a in (rows[:, :4], rows[:, 4], rows[:, 5]))
@@ -143,12 +153,15 @@ class Layers:
 def _grid(shape: Any) -> tuple[int, ...]:
     sizes = tuple(shape) if isinstance(shape, (tuple, list)) or hasattr(shape, "numel") else (shape,)
     for size in sizes:
-        if isinstance(size, float) or not size >= 0:
+        if size is None or isinstance(size, (float, str, bytes)) or not size >= 0:
             raise ValueError(f"shape: got {shape!r}, expected whole numbers of at least 0, (..., H, W)")
     return sizes
 
 
-def _check_arrays(floats: dict[str, Any], integers: dict[str, Any]) -> None:
+def _check_arrays(floats: dict[str, Any], integers: dict[str, Any], optional: tuple[str, ...] = ()) -> None:
+    for name, array in {**floats, **integers}.items():
+        if array is None and name not in optional:
+            raise TypeError(f"{name}: got NoneType, expected a torch.Tensor, wp.array or NumPy array")
     common_kind({**floats, **integers})
     first = floats["rgba"]
     precision = dtype_name(first)

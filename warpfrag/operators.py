@@ -40,8 +40,8 @@ SERIES_OPACITY = wp.constant(0.02)
 # What lets less than this through is opaque, and nothing is divided by less: in single precision derivatives of such
 # quotients would overflow.
 NEGLIGIBLE = wp.constant(1.0e-24)
-# The weight of a slab can triple whenever it is divided (all three parts of an opaque slab are opaque). Above this limit
-# no other slab has a say in a mix: there it stays, with no derivative, before it overflows.
+# The weight of a slab can triple whenever it is divided (all three parts of an opaque slab are opaque). Above this
+# limit no other slab has a say in a mix: there it stays, with no derivative, before it overflows.
 WEIGHT_LIMIT = wp.constant(1.0e12)
 
 
@@ -203,7 +203,7 @@ def over_adjoint(g: Any, a: Any, b: Any):
 @wp.func(inline=True)
 def per_length(s: Any):
     """Return 1 / thickness."""
-    return type(s.z)(1.0) / wp.max(s.z - s.f, type(s.z)(NEGLIGIBLE))
+    return type(s.z)(1.0) / (s.z - s.f)
 
 
 @wp.func(inline=True)
@@ -368,18 +368,22 @@ def merge_adjoint(g: Any, a: Any, b: Any, x: Any, y: Any, v: Any, mix: int):
         scale = one
         g_part = zero
         g_total = zero
+        g_limit = zero
         if total > type(x)(NEGLIGIBLE) and not opaque:
             scale = (d_1 * x_a + a.t * y_b) / total
             g_part = (g_share_a * d_1 * x * v_a + g_share_b * d_a * y * v_b) / total
             g_total = -g_part * scale
+        elif mix == MIX_OPTICAL_DEPTH and not opaque:
+            # Here the scale is A/u, which tends to 1 as 1 - (A_a + A_b)/2 of the parts x_a/d_a and y_b/d_1.
+            g_limit = -half * (g_share_a * d_1 * x * v_a + g_share_b * d_a * y * v_b)
         mixed_a = d_1 * x * v_a * scale
         mixed_b = d_a * y * v_b * scale
         g_x += g_share_a * d_1 * v_a * scale
         g_y += g_share_b * d_a * v_b * scale
         g_d1 = g_share_a * x * v_a * scale + (g_part + g_total * v_a) * x_a
         g_da = g_share_b * y * v_b * scale + g_total * v_b * y_b
-        g_xa = (g_part + g_total * v_a) * d_1
-        g_yb = g_part * a.t + g_total * v_b * d_a
+        g_xa = (g_part + g_total * v_a) * d_1 + divide(g_limit, d_a, zero)
+        g_yb = g_part * a.t + g_total * v_b * d_a + divide(g_limit, d_1, zero)
         g_at += g_part * y_b
         g_va = g_share_a * d_1 * x * scale + g_total * d_1 * x_a
         g_vb = g_share_b * d_a * y * scale + g_total * d_a * y_b

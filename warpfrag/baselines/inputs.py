@@ -70,7 +70,8 @@ def range_of_depths(fragments: Fragments, depth_range: tuple[float, float] | Non
     if depth_range is None:
         if fragments.count == 0:
             return 1.0, 1.0
-        near, far = float(fragments.depth.min()), float(fragments.depth.max())
+        depth = fragments.depth.detach() if fragments.kind == "torch" else fragments.depth
+        near, far = float(depth.min()), float(depth.max())
         if near <= 0.0:
             raise ValueError(f"fragments: the nearest depth is {near}, expected depths above 0 (or give depth_range)")
         return near, far

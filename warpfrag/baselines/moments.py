@@ -84,9 +84,9 @@ def moment_based(
         TypeError: the fragments are Warp arrays.
         ValueError: an option does not exist, or values are not finite or out of range.
     """
-    xp = array_module(fragments)
     _check(moments, overestimation, bias)
     exact_image(fragments)
+    xp = array_module(fragments)
     kept = _moments(xp, fragments, moments, bias, depth_range)
     owner = owners(fragments)
     rgba = _double(fragments.rgba)
@@ -164,7 +164,7 @@ def _moments(
     total = sums[:, :1]
     # Pixels that absorb too little are not reconstructed; the moments of a spread-out distribution stand in.
     enough = total >= LEAST_ABSORBANCE
-    target = (0.0 * sums + 1.0) * xp.asarray([1.0, *BIAS_TARGET[count]])
+    target = xp.stack([0.0 * total[:, 0] + moment for moment in (1.0, *BIAS_TARGET[count])], 1)
     normalized = xp.where(enough, sums / xp.where(enough, total, 1.0), target)
     amount = BIAS[count] if bias is None else bias
     return _Moments(total, (1.0 - amount) * normalized + amount * target, near, far)

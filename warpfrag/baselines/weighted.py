@@ -45,8 +45,9 @@ def weighted_blended(
     """
     if equation not in (7, 8, 9, 10):
         raise ValueError(f"equation: got {equation!r}, expected 7, 8, 9 or 10")
+    exact = exact_image(fragments)
     xp = array_module(fragments)
-    opacity = exact_image(fragments)[..., 3:]
+    opacity = exact[..., 3:]
     near, far = range_of_depths(fragments, depth_range) if equation == 10 else (0.0, 0.0)
     color, own = fragments.rgba[:, :3], fragments.rgba[:, 3:]
     weight = own * _falloff(xp, fragments.depth, equation, near, far)[:, None]

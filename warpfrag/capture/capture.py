@@ -55,7 +55,7 @@ class Surfaces:
 
     def triangles(self, window: Window) -> Triangles:
         """Return the triangles as rasterising takes them."""
-        return prepare_triangles(_to_warp(self.points), self.faces, window)
+        return prepare_triangles(to_warp(self.points), self.faces, window)
 
     def stream(self) -> AbstractContextManager[Any]:
         """Return a context in which kernels run in order with torch's own work on the device."""
@@ -90,7 +90,7 @@ def place_surfaces(geometry: Geometry, camera: Camera) -> Surfaces:
         thickness=geometry.thickness,
         maps=maps,
         faces=_on_device(geometry.faces, device),
-        tables=tuple(_like(_on_device(table, device), geometry.vertices) for table in tables),
+        tables=tuple(as_kind(_on_device(table, device), geometry.vertices) for table in tables),
     )
 
 
@@ -115,10 +115,10 @@ def fragments_of_rows(surfaces: Surfaces, triangles: Triangles, starts: wp.array
     faces, depths = store_fragments(triangles, starts, total, sort)
     sort_fragments(starts, faces, depths)
     del depths
-    offsets = _like(starts, surfaces.points)
+    offsets = as_kind(starts, surfaces.points)
     inputs = (
         *(surfaces.points, surfaces.rgba, surfaces.thickness, surfaces.maps),
-        *(_like(triangles.corners, surfaces.points), _like(faces, surfaces.points), offsets, *surfaces.tables),
+        *(as_kind(triangles.corners, surfaces.points), as_kind(faces, surfaces.points), offsets, *surfaces.tables),
     )
     rgba, depth, thickness, object_id, primitive_id = apply(SHADE, inputs, **asdict(window))
     shape = (window.row_count, window.width)
@@ -207,14 +207,15 @@ def _on_device(table: np.ndarray | None, device: Any) -> wp.array | None:
     return None if table is None else wp.array(np.ascontiguousarray(table), device=device, copy=False)
 
 
-def _like(array: wp.array | None, like: Any) -> Any:
+def as_kind(array: wp.array | None, like: Any) -> Any:
     """Return a Warp array as the kind of another one, sharing its memory."""
     if array is None:
         return None
     return wp.to_torch(array) if kind_of(like) == "torch" else array.numpy()
 
 
-def _to_warp(array: Any) -> wp.array:
+def to_warp(array: Any) -> wp.array:
+    """Return a NumPy array or torch tensor as a Warp array, sharing its memory where it is contiguous."""
     if kind_of(array) == "torch":
         return wp.from_torch(array.detach().contiguous())
     return wp.array(np.ascontiguousarray(array), device="cpu", copy=False)

@@ -112,12 +112,12 @@ def prepare_triangles(points: wp.array, faces: wp.array, window: Window) -> Tria
     launch(_prepare_kernel(points.dtype), faces.shape[0], inputs, device)
     listed = band_begins = None
     if device.is_cpu:
-        lists = _list_by_band(boxes.numpy(), window.row_count)
+        lists = list_by_band(boxes.numpy(), window.row_count)
         listed, band_begins = (wp.array(array, dtype=int, device=device, copy=False) for array in lists)
     return Triangles(points, corners, boxes, window, listed, band_begins)
 
 
-def _list_by_band(boxes: np.ndarray, row_count: int) -> tuple[np.ndarray, np.ndarray]:
+def list_by_band(boxes: np.ndarray, row_count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the triangles of each band of rows, in order of submission, and where each band's begin."""
     rows = int(BAND_ROWS)
     band_count = -(-row_count // rows)

@@ -83,6 +83,54 @@ def thickness_scale(depth: wp.float64, in_p: int, near: wp.float64, far: wp.floa
     return ONE
 
 
+@wp.func(inline=True)
+def shade_color(
+    rgba: Any,
+    uv: wp.array[wp.vec2f],
+    texture_id: wp.array[int],
+    texels: wp.array[wp.vec4f],
+    textures: wp.array[wp.vec3i],
+    face: int,
+    corner: wp.vec3i,
+    hit: wp.vec3d,
+) -> wp.vec4d:
+    """Return a fragment's premultiplied colour and opacity, given its triangle, that one's corners, `hit_weights`."""
+    i = corner[0]
+    j = corner[1]
+    k = corner[2]
+    texel = wp.vec4d(ONE, ONE, ONE, ONE)
+    if texture_id.shape[0] > 0:
+        texture = texture_id[face]
+        if texture >= 0:
+            place = mix3(load_uv(uv, i), load_uv(uv, j), load_uv(uv, k), hit[0], hit[1])
+            texel = texel_between(place, look_up(texels, textures, texture, place))
+    s = premultiplied(hit[0], hit[1], load_rgba(rgba, i), load_rgba(rgba, j), load_rgba(rgba, k), texel)
+    # Rounding may leave an interpolated value just outside its range.
+    return wp.vec4d(s[0], s[1], s[2], wp.clamp(s[3], ZERO, ONE))
+
+
+@wp.func(inline=True)
+def shade_thickness(
+    rays: Rays,
+    thickness: Any,
+    maps: Any,
+    object: wp.vec3i,
+    corner: wp.vec3i,
+    hit: wp.vec3d,
+    depth: wp.float64,
+    pixel: int,
+) -> wp.float64:
+    """Return a fragment's z-thickness, given its row in the table of objects, its triangle's corners and its depth."""
+    own = mix3(
+        wp.float64(thickness[corner[0]]), wp.float64(thickness[corner[1]]), wp.float64(thickness[corner[2]]),
+        hit[0], hit[1],
+    )  # fmt: skip
+    if object[OBJECT_MAP] >= 0:
+        own = wp.float64(maps[object[OBJECT_MAP], rays.first_row * rays.width + pixel])
+    own *= thickness_scale(depth, object[OBJECT_IN_P], rays.near, rays.far)
+    return wp.max(own, ZERO)
+
+
 @cache
 def _forward_kernel(scalar: Any) -> wp.Kernel:
     vec3, vec4 = wp.types.vector(3, scalar), wp.types.vector(4, scalar)
@@ -119,35 +167,18 @@ def _forward_kernel(scalar: Any) -> wp.Kernel:
             for fragment in range(offsets[pixel], offsets[pixel + 1]):
                 face = fragment_face[fragment]
                 corner = corners[face]
-                i = corner[0]
-                j = corner[1]
-                k = corner[2]
                 hit = hit_weights(
-                    load_point(points, i), load_point(points, j), load_point(points, k),
+                    load_point(points, corner[0]), load_point(points, corner[1]), load_point(points, corner[2]),
                     x, y, rays.scale, rays.perspective,
                 )  # fmt: skip
-                texel = wp.vec4d(ONE, ONE, ONE, ONE)
-                if texture_id.shape[0] > 0:
-                    texture = texture_id[face]
-                    if texture >= 0:
-                        place = mix3(load_uv(uv, i), load_uv(uv, j), load_uv(uv, k), hit[0], hit[1])
-                        texel = texel_between(place, look_up(texels, textures, texture, place))
-                shaded = premultiplied(
-                    hit[0], hit[1], load_rgba(rgba, i), load_rgba(rgba, j), load_rgba(rgba, k), texel
-                )
                 depth = hit[2] * along
                 item = object_id[face]
                 object = objects[item]
-                own = mix3(wp.float64(thickness[i]), wp.float64(thickness[j]), wp.float64(thickness[k]), hit[0], hit[1])
-                if object[OBJECT_MAP] >= 0:
-                    own = wp.float64(maps[object[OBJECT_MAP], rays.first_row * rays.width + pixel])
-                own *= thickness_scale(depth, object[OBJECT_IN_P], rays.near, rays.far)
-                # Rounding may leave an interpolated value just outside its range.
-                fragment_rgba[fragment] = vec4(
-                    wp.vec4d(shaded[0], shaded[1], shaded[2], wp.clamp(shaded[3], ZERO, ONE))
-                )
+                shaded = shade_color(rgba, uv, texture_id, texels, textures, face, corner, hit)
+                own = shade_thickness(rays, thickness, maps, object, corner, hit, depth, pixel)
+                fragment_rgba[fragment] = vec4(shaded)
                 fragment_depth[fragment] = scalar(depth)
-                fragment_thickness[fragment] = scalar(wp.max(own, ZERO))
+                fragment_thickness[fragment] = scalar(own)
                 fragment_object[fragment] = item
                 fragment_primitive[fragment] = face - object[OBJECT_FIRST_FACE]
 

@@ -12,6 +12,7 @@ from warpfrag.interop.launch import Span, launch, worker_count
 from warpfrag.interop.operator import dtype_name, kind_of
 from warpfrag.operators import LOG_FLOOR, LOG_OPAQUE, MIX_AVERAGE, MIX_OPACITY, MIX_OPTICAL_DEPTH, Slab32, Slab64
 from warpfrag.resolve.walk import (
+    MERGE_EXACT,
     MERGE_NONE,
     MERGE_ORDER_INDEPENDENT,
     MERGE_SMOOTH,
@@ -24,10 +25,15 @@ from warpfrag.resolve.walk import (
     Scratch64,
 )
 
-Merge = Literal["none", "smooth", "order_independent"]
+Merge = Literal["none", "smooth", "order_independent", "exact"]
 Mix = Literal["opacity", "average", "optical_depth"]
 
-MERGES = {"none": MERGE_NONE, "smooth": MERGE_SMOOTH, "order_independent": MERGE_ORDER_INDEPENDENT}
+MERGES = {
+    "none": MERGE_NONE,
+    "smooth": MERGE_SMOOTH,
+    "order_independent": MERGE_ORDER_INDEPENDENT,
+    "exact": MERGE_EXACT,
+}
 MIXES = {"opacity": MIX_OPACITY, "average": MIX_AVERAGE, "optical_depth": MIX_OPTICAL_DEPTH}
 
 # The structures of each precision. (Any: kernels take these as types of arguments.)
@@ -40,12 +46,19 @@ SCRATCH: Any = {wp.float32: Scratch32, wp.float64: Scratch64}
 FRAGMENT_TENSORS = ("rgba", "depth", "thickness", "offsets", "beta", "opacity_sum")
 FRAGMENT_DIFFERENTIABLE = ("rgba", "depth", "thickness", "beta", "opacity_sum")
 MERGE_OPTIONS = {"max_layers": "int", "merge": "str", "mix": "str"}
+# Most dimensions that a wp.array has.
+WARP_DIMENSIONS = 4
 
 
 def check_options(merge: str, mix: str, max_layers: int) -> None:
     """Raise for a merge, mix or layer number that does not exist."""
     check_choice("merge", merge, get_args(Merge))
     check_choice("mix", mix, get_args(Mix))
+    if merge == "exact" and mix == "average":
+        raise ValueError(
+            "mix: got 'average' with merge 'exact', expected 'opacity' or 'optical_depth' (averages of three parts "
+            "depend on their order)"
+        )
     if isinstance(max_layers, bool) or not isinstance(max_layers, (int, np.integer)):
         raise TypeError(f"max_layers: got {max_layers!r}, expected a whole number of at least 1")
     if max_layers < 1:
@@ -58,16 +71,27 @@ def check_choice(name: str, value: Any, choices: Sequence[str]) -> None:
         raise ValueError(f"{name}: got {value!r}, expected one of {', '.join(map(repr, choices))}")
 
 
-def fragment_inputs(fragments: Fragments, beta: Any) -> tuple[Any, ...]:
-    """Return the operator inputs `FRAGMENT_TENSORS`."""
+def fragment_inputs(
+    fragments: Fragments, beta: Any, *, dimensions: int, by_fragment: bool = False
+) -> tuple[Any, ...]:
+    """Return the operator inputs `FRAGMENT_TENSORS`, for outputs of so many dimensions beside those of the grid.
+
+    With `by_fragment` beta may also be one value per fragment.
+    """
     if not isinstance(fragments, Fragments):
         raise TypeError(f"fragments: got {type(fragments).__name__}, expected Fragments")
+    most = WARP_DIMENSIONS - dimensions
+    if fragments.kind == "warp" and len(fragments.shape) > most:
+        raise ValueError(
+            f"fragments: got shape {fragments.shape}, expected at most {most} dimensions: a wp.array has at most "
+            f"{WARP_DIMENSIONS}, of which the result takes {dimensions} more"
+        )
     return (
         fragments.rgba,
         fragments.depth,
         fragments.thickness,
         as_int32(fragments.offsets),
-        beta_array(beta, fragments.rgba, fragments.shape),
+        beta_array(beta, fragments.rgba, fragments.shape, fragments.count if by_fragment else None),
         fragments.opacity_sum,
     )
 
@@ -84,8 +108,11 @@ def as_int32(array: Any) -> Any:
     return wp.array(array.numpy().astype(np.int32), device=array.device)
 
 
-def beta_array(beta: Any, like: Any, shape: tuple[int, ...]) -> Any:
-    """Return beta as an array of one entry, or of one per pixel, of the kind and precision of `like`."""
+def beta_array(beta: Any, like: Any, shape: tuple[int, ...], fragment_count: int | None = None) -> Any:
+    """Return beta as an array of one entry, one per pixel, or one per fragment if that is allowed (has a count).
+
+    It is of the kind and precision of `like`.
+    """
     kind = kind_of(like)
     if kind_of(beta) is None:
         if isinstance(beta, bool) or not isinstance(beta, (int, float, np.floating, np.integer)):
@@ -102,8 +129,11 @@ def beta_array(beta: Any, like: Any, shape: tuple[int, ...]) -> Any:
         raise TypeError(f"beta: got dtype {dtype_name(beta)}, expected {dtype_name(like)} like the fragments")
     if kind != "numpy" and beta.device != like.device:
         raise ValueError(f"beta: is on {beta.device}, expected {like.device} like the fragments")
-    if tuple(beta.shape) not in ((), (1,), tuple(shape)):
-        raise ValueError(f"beta: got shape {tuple(beta.shape)}, expected () or {tuple(shape)}")
+    shapes = [(), tuple(shape)] + ([] if fragment_count is None else [(fragment_count,)])
+    if tuple(beta.shape) not in ((1,), *shapes):
+        expected = " or ".join(map(str, shapes))
+        hint = "" if fragment_count is not None else "; one per fragment goes with merge 'exact'"
+        raise ValueError(f"beta: got shape {tuple(beta.shape)}, expected {expected}{hint}")
     return beta.reshape((math.prod(beta.shape),))
 
 
@@ -163,6 +193,13 @@ class Walk:
             *(("front", self.scalar), ("back", self.scalar)),
         ):
             setattr(scratch, name, wp.empty(rows * self.length, dtype=dtype, device=self.device))
+        targets, grad_beta = self.targets(grad_inputs), grad_inputs[4]
+        launch(kernel(*self.choice), self.pixel_count, [self.pixels, scratch, *grads, targets], self.device, rows)
+        if grad_beta is not None:
+            sum_beta(targets.beta, grad_beta)
+
+    def targets(self, grad_inputs: Sequence[wp.array | None]) -> Any:
+        """Return where kernels write gradients: the inputs' own arrays, but one value per pixel for beta."""
         grad_rgba, grad_depth, grad_thickness, _, grad_beta, grad_opacity_sum = grad_inputs
         targets = GRADIENTS[self.scalar]()
         if grad_rgba is not None:
@@ -175,9 +212,7 @@ class Walk:
             targets.opacity_sum = grad_opacity_sum
         if grad_beta is not None:
             targets.beta = wp.empty(self.pixel_count, dtype=self.scalar, device=self.device)
-        launch(kernel(*self.choice), self.pixel_count, [self.pixels, scratch, *grads, targets], self.device, rows)
-        if grad_beta is not None:
-            sum_beta(targets.beta, grad_beta)
+        return targets
 
 
 @wp.kernel(module="unique", enable_backward=False)
@@ -204,7 +239,7 @@ def longest_list(offsets: wp.array, fragment_count: int) -> int:
     extent = wp.array(np.tile(np.array([0, NO_FRAGMENT], np.int32), (rows, 1)), device=device)
     launch(list_extent, pixel_count, [offsets, fragment_count, extent], device)
     found = extent.numpy()
-    pixel = found[:, 1].min()
+    pixel = int(found[:, 1].min())
     if pixel != NO_FRAGMENT:
         begin, end = offsets[pixel : pixel + 2].numpy()
         raise ValueError(
@@ -216,12 +251,13 @@ def longest_list(offsets: wp.array, fragment_count: int) -> int:
     return int(found[:, 0].max())
 
 
-def report_invalid(invalid: wp.array, inputs: Sequence[Any]) -> None:
+def report_invalid(invalid: wp.array, inputs: Sequence[Any], beta_per: str = "pixel") -> None:
     """Raise for the first fragment or pixel that a kernel found to have values out of range.
 
     Args:
         invalid: one row per thread: lowest invalid fragment, lowest pixel with an invalid beta.
         inputs: the operator's inputs, as `fragment_inputs` orders them.
+        beta_per: what the second of a row counts: "pixel", or "fragment".
     """
     # As Python's own: NumPy's 32 bits would overflow in the address of an array's slice.
     fragment, pixel = map(int, invalid.numpy().min(axis=0))
@@ -237,7 +273,7 @@ def report_invalid(invalid: wp.array, inputs: Sequence[Any]) -> None:
         )
     if pixel != NO_FRAGMENT:
         beta = inputs[4].numpy()[min(pixel, inputs[4].shape[0] - 1)]
-        raise ValueError(f"beta: got {beta} in pixel {pixel}, expected values from 0 to 1")
+        raise ValueError(f"beta: got {beta} in {beta_per} {pixel}, expected values from 0 to 1")
 
 
 def sum_beta(grad_pixels: wp.array, grad_beta: wp.array) -> None:

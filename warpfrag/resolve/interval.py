@@ -22,6 +22,7 @@ from warpfrag.operators import (
     MIX_OPTICAL_DEPTH,
     NEGLIGIBLE,
     SERIES_OPACITY,
+    WEIGHT_LIMIT,
     depth_per_opacity,
     depth_per_opacity_gradient,
     divide,
@@ -95,13 +96,11 @@ def blend(sweep: Any, pixels: Any, pixel: int, strip: Any, base: int, mix: int, 
 def absorption_slope(u: Any, tau: Any, scale: Any):
     """Return the derivative of scale = (1 - e^-u)/u, given tau = e^-u."""
     if u < type(u)(SERIES_OPACITY):
-        sum = type(u)(0.0)
-        for i in range(7):
-            n = type(u)(7 - i)
-            sum = (n - u * sum) / (n + type(u)(1.0))
-            if i < 6:
-                sum = sum / n
-        return -sum
+        sum = type(u)(1.0)
+        for i in range(6):
+            n = type(u)(6 - i)
+            sum = type(u)(1.0) - u * (n + type(u)(1.0)) / (n * (n + type(u)(2.0))) * sum
+        return type(u)(-0.5) * sum
     return (tau - scale) / u
 
 
@@ -148,6 +147,8 @@ def blend_adjoint(
         missing += a * (weight - one + opacity)
         opacity += tau * a
         tau *= passed
+    # Where given opacity sums leave a thin part all the say, the derivatives are beyond any use.
+    limit = type(g_tau)(WEIGHT_LIMIT)
     # By itself a part stays as it is, and opaque parts have equal weights.
     varies = count > 1 and opaque_count == 0
     scale = type(g_tau)(1.0)
@@ -187,12 +188,13 @@ def blend_adjoint(
                 g_a += slope * weight + g_weight * by_a
                 g_passed += g_weight * by_passed
             else:
-                g_w += g_weight
+                g_w += wp.clamp(g_weight, -limit, limit)
                 if total > type(g_tau)(NEGLIGIBLE):
                     # scale = (1 - tau) / total: its derivative is (others - weight * scale) / total.
                     others_veil = strip.veil[at] + strip.prefix[at] * suffix_veil
-                    g_a += g_scale * ((weight * missing - (weight - one) - others_veil) / total)
-                    g_w -= g_scale * scale * (a / total)
+                    change = g_scale / total * (weight * missing - (weight - one) - others_veil)
+                    g_a += wp.clamp(change, -limit, limit)
+                    g_w -= wp.clamp(g_scale * scale * (a / total), -limit, limit)
         g_share += g_a * s.a
         # share = (rest - next_rest) / before, passed = after / before
         before = light_to(s, rest)

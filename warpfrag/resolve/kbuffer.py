@@ -25,7 +25,15 @@ import warp as wp
 from warpfrag.fragments import Fragments, Layers
 from warpfrag.interop.launch import Span, launch, worker_count
 from warpfrag.interop.operator import Operator, apply
-from warpfrag.resolve.arguments import GRADIENTS, PIXELS, as_int32, check_choice, longest_list, report_invalid, vectors
+from warpfrag.resolve.arguments import (
+    GRADIENTS,
+    PIXELS,
+    check_choice,
+    fragment_inputs,
+    longest_list,
+    report_invalid,
+    vectors,
+)
 from warpfrag.resolve.slots import DROPPED, OWNS_SLOT, SLOTS, TAIL_IN_USE, finish_slots, insert, slots_in
 from warpfrag.resolve.walk import NO_FRAGMENT, valid_fragment
 
@@ -325,7 +333,7 @@ def _forward(inputs: Sequence[Any], outputs: Sequence[Any], slots: int, merge: s
     invalid = wp.array(np.full((rows, 2), NO_FRAGMENT, np.int32), device=device)
     kernel = _forward_kernel(inputs[0].dtype, int(merge != "none"))
     launch(kernel, pixel_count, [_pixels(inputs), slots_in(*outputs, tail=tail), invalid], device, rows)
-    report_invalid(invalid, inputs)
+    report_invalid(invalid, (*inputs[:4], None, inputs[4]))
 
 
 def kbuffer_backward(
@@ -374,9 +382,7 @@ _KBUFFER = Operator(
 )
 
 
-def kbuffer(
-    fragments: Fragments, slots: int = 8, *, merge: KMerge = "order_independent", tail: Tail = "mix"
-) -> Layers:
+def kbuffer(fragments: Fragments, slots: int = 8, *, merge: KMerge = "order_independent", tail: Tail = "mix") -> Layers:
     """Stream the fragments of every pixel, in the order in which they are given, into a k-buffer.
 
     This is what a renderer that cannot store all fragments would make of them (SKB, with merging SKB+OFM): it merges
@@ -407,11 +413,10 @@ def kbuffer(
         >>> wf.kbuffer(fragments, slots=4).depth.shape
         (512, 512, 4)
     """
-    if not isinstance(fragments, Fragments):
-        raise TypeError(f"fragments: got {type(fragments).__name__}, expected Fragments")
     check_kbuffer(slots, merge, tail)
-    inputs = (fragments.rgba, fragments.depth, fragments.thickness, as_int32(fragments.offsets), fragments.opacity_sum)
-    return as_layers(apply(_KBUFFER, inputs, slots=int(slots), merge=merge, tail=tail), fragments.shape, slots)
+    *inputs, _, opacity_sum = fragment_inputs(fragments, 1.0, dimensions=2)
+    options = {"slots": int(slots), "merge": merge, "tail": tail}
+    return as_layers(apply(_KBUFFER, (*inputs, opacity_sum), **options), fragments.shape, slots)
 
 
 def as_layers(outputs: Sequence[Any], grid: tuple[int, ...], slots: int) -> Layers:

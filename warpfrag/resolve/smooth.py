@@ -32,6 +32,7 @@ from warpfrag.resolve.arguments import (
     check_options,
     fragment_inputs,
 )
+from warpfrag.resolve.exact import RESOLVE_EXACT, apply_exact
 from warpfrag.resolve.walk import (
     STEP_START,
     choose_step,
@@ -232,12 +233,13 @@ def resolve(
     Args:
         fragments: what to merge, in any order.
         beta: how a slab fills up from its front to its back (eq. 4): 0 optically (exponential), 1 linearly. A number
-            from 0 to 1, a 0-d array, or one value per pixel.
+            from 0 to 1, a 0-d array, or one value per pixel; with "exact" also one per fragment, (F,).
         max_layers: largest number M of layers per pixel; what does not fit is composited into the last.
-        merge: "smooth" subdivides overlapping slabs (SFM); "order_independent" mixes them whole (OFM); "none" keeps
-            every fragment by itself.
+        merge: "smooth" subdivides overlapping slabs one after the other (SFM); "exact" subdivides all at once, which is
+            symmetric in the fragments and continuous in depth and thickness; "order_independent" mixes overlapping
+            slabs whole (OFM); "none" keeps every fragment by itself.
         mix: weights of the colours of mixed parts: "opacity" (fragment merging, eq. 8), "average" (zSlab eq. 4.4) or
-            "optical_depth" (as deep images are flattened).
+            "optical_depth" (as deep images are flattened). "average" does not go with "exact".
 
     Returns:
         The layers, in the kind and precision of the fragments' arrays.
@@ -247,8 +249,12 @@ def resolve(
         ValueError: an option does not exist, or values are not finite or out of range.
     """
     check_options(merge, mix, max_layers)
-    options = {"max_layers": max_layers, "merge": merge, "mix": mix}
-    rgba, depth, thickness, opacity_sum, count = apply(_RESOLVE, fragment_inputs(fragments, beta), **options)
+    if merge == "exact":
+        arrays = apply_exact(RESOLVE_EXACT, fragments, beta, dimensions=2, max_layers=max_layers, mix=mix)
+    else:
+        options = {"max_layers": max_layers, "merge": merge, "mix": mix}
+        arrays = apply(_RESOLVE, fragment_inputs(fragments, beta, dimensions=2), **options)
+    rgba, depth, thickness, opacity_sum, count = arrays
     grid = fragments.shape
     return Layers(
         rgba.reshape((*grid, max_layers, 4)),

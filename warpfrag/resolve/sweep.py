@@ -75,7 +75,7 @@ class Strip32:
     the begin of the present interval. The way back alone needs the others: `r`, `power`: relative length and T^r up to
     there; `next_...`: the same of the interval's end; `share`, `pass_`, `weight`: the part's `part_share` and mix weight;
     `prefix`, `veil`: transmittance and opacity of the interval's members before it; `cut`: gradient of `rest`; `grad`,
-    `grad_beta`: its own; `others`: transmittance of the fragments of its layer before it.
+    `grad_beta`: its own; `others`: transmittance of the fragments of its layer before it; `run`: its layer.
     `active`: positions of the active fragments. By interval: `through`, `tau`: transmittance before it and of it;
     `behind`: product of its colour, later of the colour behind it, and the cotangent; `layer`: its layer.
     """
@@ -99,6 +99,7 @@ class Strip32:
     grad: wp.array[Slab32]
     grad_beta: wp.array[wp.float32]
     others: wp.array[wp.float32]
+    run: wp.array[wp.int32]
     through: wp.array[wp.float32]
     tau: wp.array[wp.float32]
     behind: wp.array[wp.float32]
@@ -128,6 +129,7 @@ class Strip64:
     grad: wp.array[Slab64]
     grad_beta: wp.array[wp.float64]
     others: wp.array[wp.float64]
+    run: wp.array[wp.int32]
     through: wp.array[wp.float64]
     tau: wp.array[wp.float64]
     behind: wp.array[wp.float64]

@@ -14,6 +14,7 @@ from typing import Any
 import warp as wp
 
 from warpfrag.operators import (
+    NEGLIGIBLE,
     WEIGHT_LIMIT,
     Slab32,
     Slab64,
@@ -35,6 +36,7 @@ wp.set_module_options({"enable_backward": False})
 MERGE_NONE = wp.constant(0)
 MERGE_SMOOTH = wp.constant(1)
 MERGE_ORDER_INDEPENDENT = wp.constant(2)
+MERGE_EXACT = wp.constant(3)
 
 STEP_START = wp.constant(0)
 STEP_MERGE = wp.constant(1)
@@ -179,7 +181,11 @@ def load_slab(pixels: Any, fragment: int, merge_kind: int):
         # Nothing else reads it, and it costs a third of all the rest.
         log_t = log_transmittance(a)
     z = pixels.depth[fragment]
-    return slab(wp.vector(rgba[0], rgba[1], rgba[2]), a, one - a, log_t, weight, z - pixels.thickness[fragment], z)
+    front = z - pixels.thickness[fragment]
+    if z - front < type(a)(NEGLIGIBLE):
+        # A surface: so thin a slab could not be divided.
+        front = z
+    return slab(wp.vector(rgba[0], rgba[1], rgba[2]), a, one - a, log_t, weight, front, z)
 
 
 @wp.func(inline=True)
