@@ -73,23 +73,28 @@ def runs(fragments: list[Fragment]) -> list[list[Fragment]]:
 
 def merge_run(run: list[Fragment], betas: dict[int, float], mix: str) -> Fragment:
     """Merge the fragments of one run into a layer; `betas` by the identity of a fragment."""
-    boundaries: dict[float, float] = {}
-    for fragment in run:
-        # The first to lie at a depth keeps it: others there move nothing.
-        if not is_surface(fragment):
-            boundaries.setdefault(fragment.front.real, fragment.front)
-    for fragment in run:
-        boundaries.setdefault(fragment.depth.real, fragment.depth)
-    cuts = [boundaries[depth] for depth in sorted(boundaries)]
+    # Where an interval before ends and the next begins; the first boundary to lie at a depth keeps it.
+    ends: dict[float, float] = {}
+    begins: dict[float, float] = {}
+    for fragment in [f for f in run if is_surface(f)]:
+        ends.setdefault(fragment.depth.real, fragment.front + (fragment.depth.real - fragment.front.real))
+        begins.setdefault(fragment.depth.real, fragment.depth)
+    for boundary in [f.front for f in run if not is_surface(f)] + [f.depth for f in run]:
+        ends.setdefault(boundary.real, boundary)
+        begins.setdefault(boundary.real, boundary)
+    cuts = sorted(ends)
     merged = NOTHING
     for index, cut in enumerate(cuts):
-        surfaces = [f for f in run if is_surface(f) and f.depth.real == cut.real]
+        surfaces = [f for f in run if is_surface(f) and f.depth.real == cut]
         if surfaces:
-            merged = over(merged, mix_all([Piece(f.color, f.opacity, f.opacity_sum) for f in surfaces], mix))
+            # The slabs around are in it with no length: all that counts is how that would grow with the thickness.
+            around = [f for f in run if f.front.real < cut < f.depth.real]
+            parts = [part_between(f, ends[cut], begins[cut], betas[id(f)], mix) for f in around]
+            merged = over(merged, mix_all(parts + [Piece(f.color, f.opacity, f.opacity_sum) for f in surfaces], mix))
         if index + 1 < len(cuts):
             end = cuts[index + 1]
-            filling = [f for f in run if f.front.real <= cut.real and f.depth.real >= end.real]
-            parts = [part_between(f, cut, end, betas[id(f)], mix) for f in filling]
+            filling = [f for f in run if f.front.real <= cut and f.depth.real >= end and not is_surface(f)]
+            parts = [part_between(f, begins[cut], ends[end], betas[id(f)], mix) for f in filling]
             if parts:
                 merged = over(merged, mix_all(parts, mix))
     depth = max((f.depth for f in run), key=lambda depth: depth.real)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from capture_scenes import orthographic, perspective, quad, scene, soup, surface
+from capture_scenes import orthographic, perspective, quad, scene, soup
 
 from warpfrag.capture import kbuffer as module
 from warpfrag.capture.capture import capture
@@ -205,7 +205,7 @@ def test_arguments_are_checked():
     with pytest.raises(ValueError, match="words: got 1, expected more than 1, for 32 slots"):
         capture_kbuffer(setting, slots=32, cull="occupancy", words=1, **plain)
     with pytest.raises(
-        MemoryError, match="8 slots for each of 200 pixels would take 44.53 KiB, expected at most 1000 B"
+        MemoryError, match=r"8 slots for each of 200 pixels would take 44\.53 KiB, expected at most 1000 B"
     ):
         capture_kbuffer(setting, memory_limit=1000)
 

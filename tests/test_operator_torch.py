@@ -15,7 +15,7 @@ import warpfrag as wf
 from warpfrag import Fragments
 from warpfrag.resolve.arguments import Walk
 
-PIXELS = generic_pixels(5, 6, 6, opaque=True)
+PIXELS = generic_pixels(4, 6, 6, opaque=True)
 OPACITY_SUM = np.linspace(1.0, 2.0, len(PIXELS.depth)) * PIXELS.rgba[:, 3]
 
 
@@ -46,7 +46,7 @@ def outputs(layers: wf.Layers) -> list[torch.Tensor]:
 def test_gradcheck(device, merge, beta_shape):
     """All inputs and all outputs by differences in float64, opaque fragments and one layer for all included."""
     # Opacities must stay below 1 when they are stepped up.
-    pixels = generic_pixels(2, 6, 4)
+    pixels = generic_pixels(0, 6, 5)
     opacity_sum = np.linspace(1.0, 2.0, len(pixels.depth)) * pixels.rgba[:, 3]
     fragments = leaves(device, pixels=pixels, opacity_sum=opacity_sum)
     beta = torch.full(beta_shape, 0.4, dtype=torch.float64, device=device, requires_grad=True)

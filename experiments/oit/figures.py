@@ -19,14 +19,18 @@ import numpy as np
 import tables
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 from PIL import Image
 
 from warpfrag.saving import replacing
 
 HERE = Path(__file__).parent
 RESULTS = Path("results") / "oit"
-# Pictures of noise do not compress: those that are committed have few colours, and stay below this [bytes].
+# Pictures of noise do not compress: they get fewer dots an inch, so that what is committed stays below this [bytes].
 LARGEST = 290_000
+DOTS = (130, 120, 110, 100, 90, 80, 70)
+# A square of an image: row, column, size, as shares of its height.
+Zoom = tuple[float, float, float]
 # Errors smaller than this are rounding [levels of 255].
 LEAST = 1e-4
 COLORS = {
@@ -46,18 +50,23 @@ STYLE = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "legend.frameon": False,
-    "savefig.dpi": 130,
 }
 
 
-def panels(arrays: Any, titles: dict[str, str], inset: tuple[float, float, float] | None = None) -> Figure:
-    """Draw images in a row; an inset (row, column, size as shares of the image) is shown three times enlarged."""
-    figure, axes = plt.subplots(1, len(titles), figsize=(2.9 * len(titles), 3.15), squeeze=False, layout="constrained")
-    for axis, (name, title) in zip(axes[0], titles.items(), strict=True):
+def panels(arrays: Any, titles: dict[str, str], *zooms: Zoom) -> Figure:
+    """Draw images in a row, and below them what lies in the frames (row, column, size: shares of the image)."""
+    edge = min(2.9, 11.0 / len(titles))
+    figure, axes = plt.subplots(
+        *(1 + len(zooms), len(titles)),
+        figsize=(edge * len(titles), (edge + 0.04) * (1 + len(zooms)) + 0.2),
+        squeeze=False,
+        layout="constrained",
+    )
+    for column, (name, title) in zip(axes.T, titles.items(), strict=True):
         image = arrays[name]
-        _show(axis, image, title)
-        if inset is not None:
-            _enlarge(axis, image, inset)
+        _show(column[0], image, title)
+        for axis, zoom in zip(column[1:], zooms, strict=True):
+            _zoom(axis, image, zoom, column[0])
     return figure
 
 
@@ -68,26 +77,25 @@ def figure_1(arrays: Any, numbers: Any) -> Figure:
         "MBT": "(b) transmittance function (MBT)",
         "SFM": "(c) merged, $t = 2P(z)$",
     }
-    return panels(arrays, titles, (0.62, 0.44, 0.16))
+    return panels(arrays, titles, (0.25, 0.3, 0.3))
 
 
 def figure_3(arrays: Any, numbers: Any) -> Figure:
     """Superimposed cubes."""
-    return panels(
-        arrays, {"over": "individual fragments: z-fighting", "SFM": "merged, $t = 2P(z)$"}, (0.42, 0.42, 0.16)
-    )
+    titles = {"over": "individual fragments: z-fighting", "SFM": "merged, $t = 2P(z)$"}
+    return panels(arrays, titles, (0.4, 0.2, 0.3))
 
 
 def figure_6(arrays: Any, numbers: Any) -> Figure:
     """Crossing cylinders."""
     titles = {"over": "individual fragments", "SFM": "SFM", "OFM": "OFM"}
-    return panels(arrays, titles, (0.42, 0.42, 0.16))
+    return panels(arrays, titles, (0.36, 0.36, 0.28))
 
 
 def figure_7(arrays: Any, numbers: Any) -> Figure:
     """Crossing spheres by beta."""
     titles = {name: f"$\\beta = {name}$" for name in ("0", "0.5", "1")}
-    return panels(arrays, titles, (0.42, 0.42, 0.16))
+    return panels(arrays, titles, (0.44, 0.44, 0.12))
 
 
 def figure_9(arrays: Any, numbers: Any) -> Figure:
@@ -119,9 +127,9 @@ def figure_8(arrays: Any, numbers: Any) -> Figure:
 def figure_10(arrays: Any, numbers: Any) -> Figure:
     """Difference heat maps."""
     ways = ("MBT", "SKB", "SKB+OFM", "DFB+SFM", "exact")
-    height = 1.75 * len(numbers)
+    height = 1.6 * len(numbers)
     figure, axes = plt.subplots(
-        len(numbers), 1 + len(ways), figsize=(10.4, height + 0.45), squeeze=False, layout="constrained"
+        len(numbers), 1 + len(ways), figsize=(10.4, height + 0.25), squeeze=False, layout="constrained"
     )
     # One scale for all, which the worst method of the paper's three just fills.
     worst = max(np.percentile(arrays[f"{scene}/{way}/difference"], 99.5) for scene in numbers for way in ways)
@@ -165,7 +173,7 @@ def figure_10b(arrays: Any, numbers: Any) -> Figure:
             axis.minorticks_off()
             axis.set_xlabel(label)
             axis.grid(alpha=0.25)
-        column[0].axhline(about["errors"]["SKB"]["mean"], color=COLORS["SKB"], ls="--", lw=1, label="SKB")
+        column[0].axhline(max(about["errors"]["SKB"]["mean"], LEAST), color=COLORS["SKB"], ls="--", lw=1, label="SKB")
         column[0].set_title(scene)
     for axis in axes[:, 0]:
         axis.set_ylabel("mean difference [levels of 255]")
@@ -175,17 +183,17 @@ def figure_10b(arrays: Any, numbers: Any) -> Figure:
 
 def figure_11(arrays: Any, numbers: Any) -> Figure:
     """Bunny, planes and text."""
-    ways = {
-        "DFB": "(a) DFB: coplanar text fights with its plane",
-        "MBT": "(b) MBT",
-        "SKB": "(c) SKB",
-        "DFB+SFM": "(a') DFB+SFM, $t = 2P(z)$",
-        "SKB+OFM": "(d) SKB+OFM, $t = 2P(z)$",
-        "SKB+OFM, 100P": "(d') SKB+OFM, $t = 100P(z)$",
-    }
-    figure, axes = plt.subplots(2, 3, figsize=(9.0, 6.4), layout="constrained")
-    for axis, (way, title) in zip(axes.flat, ways.items(), strict=True):
-        _show(axis, arrays[way], title)
+    ways = {"DFB": "(a) DFB, not merged", "MBT": "(b) MBT", "SKB": "(c) SKB", "SKB+OFM": "(d) SKB+OFM, $t = 2P(z)$"}
+    figure = plt.figure(figsize=(11.0, 4.1), layout="constrained")
+    left, right = figure.subfigures(1, 2, width_ratios=(0.58, 1.0))
+    whole = left.subplots()
+    _show(whole, arrays["DFB+SFM"], "DFB+SFM, $t = 2P(z)$")
+    zooms = ((0.08, 0.02, 0.3), (0.5, 0.52, 0.3))
+    for row, zoom in zip(right.subplots(len(zooms), len(ways)), zooms, strict=True):
+        for axis, (way, title) in zip(row, ways.items(), strict=True):
+            _zoom(axis, arrays[way], zoom, whole)
+            if zoom is zooms[0]:
+                axis.set_title(title, fontsize=8)
     return figure
 
 
@@ -257,28 +265,25 @@ def _show(axis: Axes, image: np.ndarray, title: str | None = None) -> None:
     axis.spines[:].set_visible(False)
 
 
-def _enlarge(axis: Axes, image: np.ndarray, inset: tuple[float, float, float]) -> None:
-    height, width = image.shape[:2]
-    row, column, size = inset[0] * height, inset[1] * width, inset[2] * height
-    box = axis.inset_axes((0.0, 0.0, 0.36, 0.36))
-    box.imshow(image, interpolation="nearest")
-    box.set(xlim=(column, column + size), ylim=(row + size, row), xticks=[], yticks=[])
-    box.spines[:].set(visible=True, color="black")
-    axis.indicate_inset(((column, row, size, size)), edgecolor="black", alpha=1.0, lw=0.8)
+def _zoom(axis: Axes, image: np.ndarray, zoom: Zoom, whole: Axes) -> None:
+    """Show a square of an image, pixel by pixel, and frame it in the whole."""
+    row, column, edge = (round(share * image.shape[0]) for share in zoom)
+    axis.imshow(image[row : row + edge, column : column + edge], interpolation="nearest")
+    axis.set(xticks=[], yticks=[])
+    axis.spines[:].set(visible=True, color="black")
+    whole.add_patch(Rectangle((column, row), edge, edge, fill=False, edgecolor="black", lw=0.8))
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a figure as a PNG of at most 256 colours, fewer where it would be too large."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer)
-    plt.close(figure)
-    image = Image.open(buffer).convert("RGB")
-    for colors in (256, 128, 64, 32):
+    """Write a figure as a PNG, at a lower resolution where it would be too large."""
+    for dpi in DOTS:
+        buffer = io.BytesIO()
+        figure.savefig(buffer, dpi=dpi)
         content = io.BytesIO()
-        # Without dithering: it costs more bytes than it hides.
-        image.quantize(colors, dither=Image.Dither.NONE).save(content, "PNG", optimize=True)
+        Image.open(buffer).convert("RGB").save(content, "PNG", optimize=True)
         if content.tell() <= LARGEST:
             break
+    plt.close(figure)
     with replacing(path) as temporary:
         temporary.write_bytes(content.getvalue())
 

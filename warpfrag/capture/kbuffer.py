@@ -1,7 +1,7 @@
 """The bounded capture: a scene straight into the slots of a k-buffer, whatever its depth complexity.
 
-Memory is that of the layers, K slots of 28 bytes (in single precision) and a number of 4 bytes a pixel, and the lists of
-triangles that rasterising takes. The layers are those of `kbuffer(capture(scene, sort=False))`, to the bit.
+Memory is that of the layers, K slots of 28 bytes (in single precision) and a number of 4 bytes a pixel, and the lists
+of triangles that rasterising takes. The layers are those of `kbuffer(capture(scene, sort=False))`, to the bit.
 
 Gradients are those of `resolve.kbuffer` and of `capture.shade`. The way back needs the fragments, so it captures them
 again, in bands of rows that take `BAND_BYTES` (or one row): between the passes nothing is kept but the scene.
@@ -119,7 +119,7 @@ def _backward(
         partial = [None if target is None else wp.empty_like(target) for target in targets]
         _backward_band(inputs, counts[pixels], prepare_triangles(points, faces, band), grads, partial, choice)
         for target, part in zip(targets, partial, strict=True):
-            if target is not None:
+            if target is not None and part is not None:
                 add(target.flatten(), part.flatten())
 
 

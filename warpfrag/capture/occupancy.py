@@ -34,7 +34,7 @@ def set_bucket(words: wp.array2d[wp.uint32], pixel: int, bucket: int):
 
 @wp.func(inline=True)
 def last_bucket(words: wp.array2d[wp.uint32], pixel: int, bits: int) -> int:
-    """Return the bucket of the `bits`-th bit set, counted by clearing the lowest one; the last bucket if they are less."""
+    """Return the bucket of the `bits`-th bit set, counted by clearing the lowest; the last one if there are fewer."""
     bucket = int(words.shape[1] * WORD_BITS - 1)
     found = int(0)
     for word in range(words.shape[1]):

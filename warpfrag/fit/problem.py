@@ -12,12 +12,14 @@ from typing import Any
 import numpy as np
 
 from warpfrag.capture.capture import capture
+from warpfrag.capture.kbuffer import capture_kbuffer
 from warpfrag.capture.render import render
 from warpfrag.composite import composite
 from warpfrag.fit.parameters import Variable
 from warpfrag.fit.study import Study, StudyError
 from warpfrag.fragments import Fragments
 from warpfrag.interop.operator import kind_of
+from warpfrag.resolve.kbuffer import kbuffer
 from warpfrag.scene.objects import Scene
 
 
@@ -27,11 +29,12 @@ class FrozenGeometry:
     Args:
         scene: the scene.
         variables: what will be given to `scaled`, all global.
+        sort: whether the fragments are to be sorted by depth, or in order of submission.
     """
 
-    def __init__(self, scene: Scene, variables: Sequence[Variable]) -> None:
+    def __init__(self, scene: Scene, variables: Sequence[Variable], sort: bool = True) -> None:
         ones = {v.name: np.ones(v.start.shape, np.float32) for v in variables if v.key != "beta"}
-        self.fragments: Fragments = capture(scene, parameters=ones).numpy()
+        self.fragments: Fragments = capture(scene, parameters=ones, sort=sort).numpy()
         owners = {variable.owner for variable in variables}
         self.masks: dict[str, Any] = {
             item.name: self.fragments.object_id == index
@@ -80,7 +83,8 @@ class Problem:
         self.reference = reference_image(study)
         self.channels = self.reference.shape[2]
         self.background = np.asarray(self.scene.background, np.float32)
-        self.frozen = FrozenGeometry(self.scene, study.variables) if study.is_global else None
+        sort = study.resolve == "sorted"
+        self.frozen = FrozenGeometry(self.scene, study.variables, sort) if study.is_global else None
 
     def values(self, coordinates: np.ndarray) -> dict[str, np.ndarray]:
         """Return the parameters for a vector of a method's coordinates."""
@@ -110,6 +114,8 @@ class Problem:
     def composite(self, fragments: Fragments, beta: Any) -> Any:
         """Composite fragments as the scene says, without its background."""
         scene = self.scene
+        if self.study.resolve == "kbuffer":
+            return composite(kbuffer(fragments, scene.layers, merge=scene.merge))  # type: ignore[arg-type]
         return composite(fragments, beta, max_layers=scene.layers, merge=scene.merge, mix=scene.mix)  # type: ignore[arg-type]
 
     def image(self, values: Mapping[str, Any], frozen: FrozenGeometry | None = None) -> Any:
@@ -122,7 +128,7 @@ class Problem:
         single = {name: _single(value) for name, value in values.items()}
         frozen = frozen or self.frozen
         if frozen is None:
-            return render(self.scene, parameters=single)
+            return render_scene(self.scene, self.study.resolve, single)
         beta = single.get("beta", float(self.scene.beta))
         return self.over_background(self.composite(frozen.scaled(single), beta))
 
@@ -146,6 +152,15 @@ def _like(array: np.ndarray, image: Any) -> Any:
 
 def _single(value: Any) -> Any:
     return value.float() if kind_of(value) == "torch" else np.asarray(value, np.float32)
+
+
+def render_scene(scene: Scene, resolve: str, parameters: Mapping[str, Any]) -> Any:
+    """Render a scene as `Study.resolve` says."""
+    if resolve == "sorted":
+        return render(scene, parameters=parameters)
+    layers = capture_kbuffer(scene, slots=scene.layers, merge=scene.merge, parameters=parameters)  # type: ignore[arg-type]
+    image = composite(layers)
+    return image + (1.0 - image[..., 3:]) * _like(np.asarray(scene.background, np.float32), image)
 
 
 def reference_image(study: Study) -> np.ndarray:
@@ -173,7 +188,7 @@ def reference_image(study: Study) -> np.ndarray:
     samples = reference.supersampling
     options = {key: getattr(reference, key) or getattr(scene, key) for key in ("merge", "mix", "layers")}
     fine = replace(scene, camera=scene.camera.resized((width * samples, height * samples)), **options)
-    image = np.asarray(render(fine, parameters=dict(reference.true or {})))
+    image = np.asarray(render_scene(fine, study.resolve, dict(reference.true or {})))
     if samples > 1:
         image = image.reshape(height, samples, width, samples, 4).mean(axis=(1, 3), dtype=np.float64)
     return np.ascontiguousarray(image, np.float32)

@@ -130,6 +130,7 @@ def _setting(study: Study) -> dict[str, Any]:
         "method": study.method,
         "loss_name": study.loss,
         "size": list(scene.camera.size),
+        "resolve": study.resolve,
         "merge": scene.merge,
         "mix": scene.mix,
         "layers": scene.layers,

@@ -198,7 +198,7 @@ def fingerprint(study: Study, reference: np.ndarray) -> str:
                 digest.update(np.ascontiguousarray(thing).tobytes())
 
     scene = study.scene
-    add(scene.camera, scene.background, scene.beta, scene.layers, scene.merge, scene.mix, reference)
+    add(scene.camera, scene.background, scene.beta, scene.layers, scene.merge, scene.mix, study.resolve, reference)
     for item in scene.objects:
         add(item.name, item.thickness_unit, item.faces, item.matrix)
         for value in (item.vertices, item.color, item.opacity, item.thickness, item.uv, item.texture_index, item.shade):

@@ -5,6 +5,7 @@ A study file:
 scene = "../three_spheres.toml"       # relative to the study file
 method = "least_squares"              # or "adam", "lbfgs"; loss, delta, steps, tolerance, seed, restarts, …
 size = [256, 256]                     # and merge, mix, layers: in place of the scene's own
+resolve = "kbuffer"                   # how images come about; default "sorted"
 
 [reference]
 true = {beta = 0.5, red.thickness = 0.15}     # a render of the scene with these values; or image = "photo.png"
@@ -43,6 +44,7 @@ from warpfrag.scene.table import Table, is_number, is_numbers, read_toml
 
 Method = Literal["least_squares", "adam", "lbfgs"]
 Loss = Literal["l2", "l1", "huber"]
+Resolve = Literal["sorted", "kbuffer"]
 
 # Steps a method takes at most unless told: evaluations of least squares, iterations of the others.
 DEFAULT_STEPS = {"least_squares": 100, "adam": 300, "lbfgs": 100}
@@ -60,7 +62,7 @@ _TOP: tuple[str, ...] = (
     "seed",
     "restarts",
 )
-_TOP += ("learning_rate", "device", "checkpoint_seconds", "size", *_RENDER)
+_TOP += ("learning_rate", "device", "checkpoint_seconds", "size", "resolve", *_RENDER)
 _MOST_PIXELS, _MOST_STEPS = 65536, 10**9
 _P = re.compile(r"\s*([0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)\s*P\s*")
 
@@ -112,6 +114,8 @@ class Study:
         learning_rate: Adam's step: beta, opacity and colour as they are, relative for a thickness.
         device: where torch and Warp compute.
         checkpoint_seconds: time between two checkpoints.
+        resolve: how fragments become layers, in the reference as well: "sorted", or "kbuffer", as they come, into as
+            many slots as the scene has layers (then beta plays no part).
         name: names the default output folder.
 
     Raises:
@@ -131,6 +135,7 @@ class Study:
     learning_rate: float = 0.02
     device: str = "cpu"
     checkpoint_seconds: float = 2.0
+    resolve: Resolve = "sorted"
     name: str = "study"
     variables: tuple[Variable, ...] = field(init=False, repr=False)
 
@@ -149,7 +154,11 @@ class Study:
             raise
         except (ValueError, TypeError) as error:
             raise StudyError(str(error)) from error
-        for key, choices in (("loss", get_args(Loss)), ("method", (*get_args(Method), None))):
+        for key, choices in (
+            ("loss", get_args(Loss)),
+            ("method", (*get_args(Method), None)),
+            ("resolve", get_args(Resolve)),
+        ):
             if getattr(self, key) not in choices:
                 expected = ", ".join(f'"{choice}"' for choice in choices if choice)
                 raise StudyError(f"{key}: found {shorten(getattr(self, key))}, expected one of {expected}")
@@ -159,6 +168,8 @@ class Study:
             other = next(v.name for v in self.variables if not v.is_global)
             expected = '"adam" or "lbfgs" (least squares fits one value per object)'
             raise StudyError(f'method: found "least_squares" for {other}, expected {expected}')
+        if self.resolve == "kbuffer":
+            self._check_kbuffer()
         if self.steps is None:
             object.__setattr__(self, "steps", DEFAULT_STEPS[str(self.method)])
         for key, least in (("steps", 1), ("seed", 0), ("restarts", 0)):
@@ -193,6 +204,15 @@ class Study:
     def resized(self, size: tuple[int, int]) -> "Study":
         """Return this study with another image size (width, height)."""
         return replace(self, scene=replace(self.scene, camera=self.scene.camera.resized(size)))
+
+    def _check_kbuffer(self) -> None:
+        scene = self.scene
+        for key, choices in (("merge", ("order_independent", "none")), ("mix", ("opacity",))):
+            if getattr(scene, key) not in choices:
+                expected = " or ".join(f'"{choice}"' for choice in choices)
+                raise StudyError(f'{key}: found "{getattr(scene, key)}" with resolve "kbuffer", expected {expected}')
+        if "beta" in self.parameters:
+            raise StudyError('parameters: found beta with resolve "kbuffer", in which it plays no part')
 
     def _check_reference(self) -> None:
         reference = self.reference
@@ -236,7 +256,8 @@ def load_study(path: str | os.PathLike, *, size: tuple[int, int] | None = None) 
         top = Table(data, path, "", _TOP)
         scene = _scene(top, path, size)
         values: dict[str, Any] = {
-            key: top.choice(key, get_args(kind)) for key, kind in (("loss", Loss), ("method", Method))
+            key: top.choice(key, get_args(kind))
+            for key, kind in (("loss", Loss), ("method", Method), ("resolve", Resolve))
         }
         values["steps"] = top.integer("steps", 1, _MOST_STEPS)
         values["seed"] = top.integer("seed", 0, 2**63 - 1)

@@ -110,3 +110,8 @@ def _pool(threads: int) -> tuple[ThreadPoolExecutor, Any]:
         own.number = next(numbers)
 
     return ThreadPoolExecutor(threads, thread_name_prefix="warpfrag", initializer=take_number), lambda: own.number
+
+
+if hasattr(os, "register_at_fork"):
+    # A forked process inherits pools without their threads, and would wait for those forever.
+    os.register_at_fork(after_in_child=_pool.cache_clear)

@@ -4,8 +4,8 @@ A slot holds sums, so that mixing costs a few additions and its members may come
 
     q = sum C_i w_i,   A = 1 - prod (1 - A_i),   S = sum S_i,   front = min f_i,   z = max z_i,   w_i = S_i / A_i
 
-and its colour is q A / S in the end. Slots live in the arrays of `Layers` themselves: until `finish_slots`, `rgba` holds
-(q, A) and `thickness` the front. There is no memory of a pixel's fragments beyond these.
+and its colour is q A / S in the end. Slots live in the arrays of `Layers` themselves: until `finish_slots`, `rgba`
+holds (q, A) and `thickness` the front. There is no memory of a pixel's fragments beyond these.
 
 Core slots do not overlap, so they are kept in depth order: slot number n - 1 is the farthest kept (the first slot of a
 max array), and whatever a fragment overlaps is a run of slots. The tail, once in use, lies behind all of them.
@@ -69,7 +69,7 @@ SLOTS: Any = {wp.float32: Slots32, wp.float64: Slots64}
 
 
 def slots_in(
-    rgba: wp.array, depth: wp.array, front: wp.array, opacity_sum: wp.array, count: wp.array, tail: str
+    rgba: wp.array, depth: wp.array, front: wp.array, opacity_sum: wp.array, count: wp.array, *, tail: str
 ) -> Any:
     """Return the slots that live in the arrays of layers, (P, K, 4), (P, K) and (P,)."""
     slots = SLOTS[depth.dtype]()
