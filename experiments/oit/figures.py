@@ -184,11 +184,11 @@ def figure_10b(arrays: Any, numbers: Any) -> Figure:
 def figure_11(arrays: Any, numbers: Any) -> Figure:
     """Bunny, planes and text."""
     ways = {"DFB": "(a) DFB, not merged", "MBT": "(b) MBT", "SKB": "(c) SKB", "SKB+OFM": "(d) SKB+OFM, $t = 2P(z)$"}
-    figure = plt.figure(figsize=(11.0, 4.1), layout="constrained")
-    left, right = figure.subfigures(1, 2, width_ratios=(0.58, 1.0))
+    figure = plt.figure(figsize=(11.0, 3.9), layout="constrained")
+    left, right = figure.subfigures(1, 2, width_ratios=(0.5, 1.0))
     whole = left.subplots()
     _show(whole, arrays["DFB+SFM"], "DFB+SFM, $t = 2P(z)$")
-    zooms = ((0.08, 0.02, 0.3), (0.5, 0.52, 0.3))
+    zooms = ((0.12, 0.06, 0.2), (0.54, 0.57, 0.2))
     for row, zoom in zip(right.subplots(len(zooms), len(ways)), zooms, strict=True):
         for axis, (way, title) in zip(row, ways.items(), strict=True):
             _zoom(axis, arrays[way], zoom, whole)

@@ -17,6 +17,7 @@ SCENES = Path(__file__).parents[2] / "scenes"
 WHITE = (1.0, 1.0, 1.0, 1.0)
 # The paper's z-thickness in the comparisons, in multiples of P(z).
 THICKNESS = 100.0
+VIEW = (1.9, 1.5, 2.6)
 AMBIENT = 0.35
 LIGHT = (0.4, 0.8, 0.6)
 
@@ -74,8 +75,8 @@ def occlusion(size: int, count: int = 30_000, points: Path | None = None) -> wf.
     return wf.Scene(camera, objects, background=WHITE)
 
 
-def of_model(path: Path, size: int, opacity: float = 0.2) -> wf.Scene:
-    """Return a scene of a mesh or point file, all of it in view, with the colours that it brings."""
+def of_model(path: Path, size: int, view: Sequence[float] = VIEW, opacity: float = 0.2) -> wf.Scene:
+    """Return a scene of a mesh or point file, all of it in view, seen from a direction, with the colours that it brings."""
     mesh = None
     if path.suffix.lower() in POINT_SUFFIXES:
         try:
@@ -90,7 +91,8 @@ def of_model(path: Path, size: int, opacity: float = 0.2) -> wf.Scene:
     scale = 2.0 / np.linalg.norm(high - low)
     normals = smooth_normals(mesh.vertices, mesh.faces) if mesh.normals is None else mesh.normals
     mesh = replace(mesh, vertices=(mesh.vertices - (low + high) / 2.0) * scale, normals=normals)
-    camera = _camera((1.9, 1.5, 2.6), (0.0, 0.0, 0.0), 36.0, size)
+    eye = 3.5 * np.asarray(view) / np.linalg.norm(view)
+    camera = _camera(eye, (0.0, 0.0, 0.0), 35.0, size)
     color: Any = (0.8, 0.8, 0.8) if mesh.color is None else None
     return wf.Scene(camera, [_item(path.stem, mesh, color, opacity, camera)], background=WHITE)
 

@@ -116,7 +116,7 @@ class Problem:
         scene = self.scene
         if self.study.resolve == "kbuffer":
             return composite(kbuffer(fragments, scene.layers, merge=scene.merge))  # type: ignore[arg-type]
-        return composite(fragments, beta, max_layers=scene.layers, merge=scene.merge, mix=scene.mix)  # type: ignore[arg-type]
+        return composite(fragments, beta, max_layers=scene.layers, merge=scene.merge, mix=scene.mix)
 
     def image(self, values: Mapping[str, Any], frozen: FrozenGeometry | None = None) -> Any:
         """Return the image for parameter values, (H, W, 4) float32.

@@ -93,7 +93,7 @@ def with_member(m: Members, pixels: Any, fragment: int, merging: int):
     else:
         sum.opaque = m.opaque + 1
     sum.back = m.back
-    if m.back < 0 or pixels.depth[fragment] < pixels.depth[m.back]:
+    if m.back < 0 or pixels.depth[fragment] > pixels.depth[m.back]:
         sum.back = fragment
     sum.front = m.front
     if m.front < 0 or front_of(pixels, fragment, merging) < front_of(pixels, m.front, merging):
