@@ -155,7 +155,7 @@ class Gradients(NamedTuple):
 def exact_gradient(
     rgba, depth, thickness, offsets, beta=1.0, opacity_sum=None, *, cotangents=None, image_cotangent=None, **options
 ) -> Gradients:
-    """Pull cotangents of (rgba, depth, thickness, opacity_sum) of the layers, or of the image, back by complex steps."""
+    """Pull cotangents of the layers (rgba, depth, thickness, opacity_sum), or of the image, back by complex steps."""
     rows, betas = fragment_rows(rgba, depth, thickness, opacity_sum), by_fragment(beta, offsets)
     # One more column: β.
     rows = np.column_stack([rows, betas])

@@ -94,6 +94,14 @@ def test_gradients_in_general_position(device, merge, mix, max_layers):
 
 
 @pytest.mark.parametrize("mix", MIXES)
+def test_gradients_of_faint_slabs(device, mix):
+    """Opacities of 0.001 to 0.024, where series replace quotients, or just do not yet."""
+    pixels = generic_pixels(25, 60)
+    pixels = pixels._replace(rgba=pixels.rgba / 40.0)
+    compare(pixels, np.resize(BETAS, 60), 1e-10, device, mix=mix)
+
+
+@pytest.mark.parametrize("mix", MIXES)
 @pytest.mark.parametrize("merge", ["smooth", "order_independent"])
 def test_gradients_of_opaque_slabs(device, merge, mix):
     """A third of the opacities is exactly 1: nothing is divided by what passes them."""

@@ -66,6 +66,15 @@ def test_single_precision_layers_are_those_of_the_reference(device, merge, mix):
     assert_layers(layers, expected, pixels, mix, tolerance)
 
 
+def test_faint_layers_are_those_of_the_reference(device):
+    """Opacities of 0.001 to 0.024, where series replace quotients, or just do not yet: to a few roundings."""
+    pixels = random_pixels(9, 200, without=("many",))
+    pixels = pixels._replace(rgba=pixels.rgba / 40.0)
+    for mix in MIXES:
+        layers, expected = resolve_both(pixels, np.resize(BETAS, 200), "float64", device, mix=mix)
+        assert_layers(layers, expected, pixels, mix, 1e-13)
+
+
 def test_a_given_opacity_sum_weighs_the_colours(device):
     """Fragments that were merged before bring S > A along."""
     pixels = random_pixels(11, 300, without=("many",))

@@ -166,7 +166,8 @@ def figure_10b(arrays: Any, numbers: Any) -> Figure:
             for way, row in about[key].items():
                 # No error at all is below any axis.
                 points = [(float(at), error) for at, error in row.items() if error > LEAST]
-                axis.loglog(*zip(*points, strict=True), "o-", ms=3, color=COLORS[way], label=way)
+                if points:
+                    axis.loglog(*zip(*points, strict=True), "o-", ms=3, color=COLORS[way], label=way)
             axis.axvline(mark, color="#aaaaaa", lw=0.8, ls=":")
             ticks = [float(at) for at in row]
             axis.set_xticks(ticks, [f"{at:g}" for at in ticks])
@@ -239,13 +240,13 @@ def figure_13(arrays: Any, numbers: Any) -> Figure:
     behind = np.append(arrays["DFB/depth"], end), np.append(arrays["DFB/absorbance"], arrays["DFB/absorbance"][-1])
     axes = right.subplots(len(rows), 1, sharex=True, sharey=True)
     for axis, ways in zip(axes, rows, strict=True):
-        axis.fill_between(*behind, color="#dddddd", label="DFB: every fragment", lw=0)
+        axis.fill_between(*behind, color="#d4d4d4", label="DFB: every fragment", lw=0)
         for way, style in zip(ways, ("-", "--"), strict=True):
             label = f"{way} ({numbers['mean difference'][way]:.4f})"
             axis.plot(
                 arrays[f"{way}/depth"], arrays[f"{way}/absorbance"], style, color=COLORS[way], lw=1.4, label=label
             )
-        axis.legend(loc="upper left", fontsize=8)
+        axis.legend(loc="lower right", fontsize=8, frameon=True, facecolor="white", edgecolor="white")
         axis.set(ylabel="absorbance", ylim=(0, 1.02))
         axis.grid(alpha=0.25)
     axes[-1].set_xlabel("depth along the ray [scene units]; in brackets the mean difference from DFB")

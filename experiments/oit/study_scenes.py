@@ -76,7 +76,7 @@ def occlusion(size: int, count: int = 30_000, points: Path | None = None) -> wf.
 
 
 def of_model(path: Path, size: int, view: Sequence[float] = VIEW, opacity: float = 0.2) -> wf.Scene:
-    """Return a scene of a mesh or point file, all of it in view, seen from a direction, with the colours that it brings."""
+    """Return a scene of a mesh or point file that fills the image, seen from a direction, with its own colours."""
     mesh = None
     if path.suffix.lower() in POINT_SUFFIXES:
         try:
@@ -93,6 +93,10 @@ def of_model(path: Path, size: int, view: Sequence[float] = VIEW, opacity: float
     mesh = replace(mesh, vertices=(mesh.vertices - (low + high) / 2.0) * scale, normals=normals)
     eye = 3.5 * np.asarray(view) / np.linalg.norm(view)
     camera = _camera(eye, (0.0, 0.0, 0.0), 35.0, size)
+    view_matrix = camera.view_matrix()
+    x, y, z = view_matrix[:3, :3] @ mesh.vertices.T + view_matrix[:3, 3:]
+    tangent = 1.05 * max(np.abs(x / z).max(), np.abs(y / z).max())
+    camera = replace(camera, fov=float(np.degrees(2.0 * np.arctan(tangent))))
     color: Any = (0.8, 0.8, 0.8) if mesh.color is None else None
     return wf.Scene(camera, [_item(path.stem, mesh, color, opacity, camera)], background=WHITE)
 

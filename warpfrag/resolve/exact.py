@@ -7,10 +7,10 @@ overlapping slabs becomes a layer; what does not fit into `max_layers` is compos
 The result does not depend on any sequence: it is symmetric in the fragments, and continuous in depth and thickness
 while t > 0. The cost of a pixel is that of sorting plus one step for every pair of an interval and a slab in it.
 
-The opacity of a layer is that of its fragments, 1 - prod T_i, and has a gradient in nothing else. For the colour the way
-back sweeps twice: the first time it records P_k, tau_k and <g, c_k>, from which follows <g, B_k>, B the colour behind;
-then, with dL/dc_k = P_k g and dL/dtau_k = P_k <g, B_k>, the adjoint of each interval. Memory is that of the fragments of
-one pixel for each thread. Differentiable in colour, opacity, depth, thickness, opacity sum and beta (also by fragment);
+The opacity of a layer is that of its fragments, 1 - prod T_i, and has a gradient in nothing else. For the colour the
+way back sweeps twice. First it records P_k, tau_k and <g, c_k>, from which follows <g, B_k>, B the colour behind. Then,
+with dL/dc_k = P_k g and dL/dtau_k = P_k <g, B_k>, it takes the adjoint of each interval. Each thread has memory for
+the fragments of one pixel. Differentiable in colour, opacity, depth, thickness, opacity sum and beta (also by fragment);
 the order of the boundaries, runs and what falls into the tail are held fixed.
 """
 

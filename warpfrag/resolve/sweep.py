@@ -1,12 +1,13 @@
-"""Sweeping through the boundaries of a pixel's slabs, front to back: which intervals there are and which slabs fill them.
+"""Sweeping through the boundaries of a pixel's slabs, front to back: which intervals there are and what fills them.
 
 All fronts and backs cut the ray into intervals. Fragments are entered in order of their fronts; those that fill the
-present interval are the active ones. Surfaces (t = 0) are entered in an interval of no length by themselves: its members
-are the surfaces at one depth, behind what ends there and before what begins there. Where nothing is active a run of
-overlapping slabs ends, and a layer with it.
+present interval are the active ones. Surfaces (t = 0) are entered in an interval of no length by themselves: its
+members are the surfaces at one depth, behind what ends there and before what begins there. Where nothing is active a
+run of overlapping slabs ends, and a layer with it.
 
 An interval is known by the boundaries at its two ends, numbered 2 p for the front and 2 p + 1 for the back of the
-fragment at position p in the order of fronts. Which boundary follows which is a discrete choice, held fixed by adjoints.
+fragment at position p in the order of fronts. Which boundary follows which is a discrete choice that adjoints hold
+fixed; of boundaries in one place the first found stands for all.
 """
 
 from typing import Any
@@ -73,7 +74,7 @@ class Strip32:
 
     By position in the order of fronts: `order`: fragment; `fragment`: it as a slab; `rest`: share of its opacity behind
     the begin of the present interval. The way back alone needs the others: `r`, `power`: relative length and T^r up to
-    there; `next_...`: the same of the interval's end; `share`, `pass_`, `weight`: the part's `part_share` and mix weight;
+    there; `next_...`: the same of the interval's end; `share`, `pass_`, `weight`: a part's `part_share`, mix weight;
     `prefix`, `veil`: transmittance and opacity of the interval's members before it; `cut`: gradient of `rest`; `grad`,
     `grad_beta`: its own; `others`: transmittance of the fragments of its layer before it; `run`: its layer.
     `active`: positions of the active fragments. By interval: `through`, `tau`: transmittance before it and of it;
