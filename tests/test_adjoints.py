@@ -209,10 +209,10 @@ def test_hundreds_of_dense_slabs_have_gradients(device, opacity, mix):
     rgba = np.column_stack([rng.uniform(0.0, opacity, (200, 3)), np.full(200, opacity)]).astype(np.float32)
     depth = np.sort(rng.choice(np.arange(4096, 8192), 200, replace=False)) / 4096.0
     pixel = Pixels(rgba.astype(np.float64), depth, np.full(200, 2048.5 / 4096.0), np.array([0, 200]))
-    for merge in ("smooth",) if mix == "average" else ("smooth", "order_independent"):
+    for merge, beta in (("smooth", 0.5), ("smooth", 0.0), ("order_independent", 0.5)):
         single, double = (
             torch_gradients(
-                image_of(merge=merge, mix=mix), pixel, 0.5, [image_cotangent(1)], dtype=dtype, device=device
+                image_of(merge=merge, mix=mix), pixel, beta, [image_cotangent(1)], dtype=dtype, device=device
             )
             for dtype in ("float32", "float64")
         )

@@ -286,3 +286,18 @@ def test_invalid_values_are_named(name):
     for function in both(merge="exact"):
         with pytest.raises(ValueError, match="fragment 5 has"):
             function(fragments_of(pixels))
+
+
+def test_fits_take_it():
+    """A fit of beta and thicknesses to a render by exact merging finds them."""
+    pytest.importorskip("scipy")
+    from small_scene import spheres
+
+    from warpfrag.fit import Reference, Study, fit
+
+    scene = spheres(size=(24, 20))
+    scene.merge = "exact"
+    starts = {"beta": 0.9, "red.thickness": 0.8, "green.thickness": 0.12, "blue.thickness": 0.6}
+    result = fit(Study(scene, Reference(true={}), starts))
+    # Single precision: residuals are known to 1e-7.
+    assert max(result.relative_errors().values()) < 1e-3

@@ -97,9 +97,7 @@ def convergence(line: Any, fits: dict[str, Any]) -> Figure:
             errors = np.sort([max(one["error"], 1e-8) for one in found[merge]])
             axis.step(errors, 100.0 * np.arange(1, len(errors) + 1) / len(errors), where="post", color=color)
         axis.axvline(FOUND, color="#999999", lw=0.8, ls=":")
-        axis.set(
-            xscale="log", xlim=(1e-8, 10.0), ylim=(-2.0, 102.0), title=case, xlabel="error of the worst parameter"
-        )
+        axis.set(xscale="log", xlim=(1e-8, 10.0), ylim=(-2.0, 102.0), title=case, xlabel="error of the worst parameter")
         axis.set_xticks([1e-8, 1e-6, 1e-4, 1e-2, 1.0])
     axes[1].set_ylabel("fits up to this error [%]")
     return figure

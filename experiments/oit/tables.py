@@ -53,8 +53,9 @@ def _claims(documents: dict[str, Any]) -> str:
             "OFM improves OIT where memory is limited: SKB+OFM against SKB (§5.1.1)",
             "error of SKB over that of SKB+OFM "
             + each(lambda about: f"{mean(about, 'SKB') / mean(about, 'SKB+OFM'):.2f}")
-            + " (both with a mixed tail); of SKB that discards what overflows "
-            + each(lambda about: f"{mean(about, 'SKB, tail discarded') / mean(about, 'SKB+OFM'):.1f}"),
+            + " (overflow mixed in the tail); "
+            + each(lambda about: f"{mean(about, 'SKB, tail discarded') / mean(about, 'SKB+OFM, tail discarded'):.2f}")
+            + " (discarded by both)",
         ],
         [
             "(ours) exact merging against SFM",

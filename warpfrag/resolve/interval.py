@@ -88,7 +88,7 @@ def blend(sweep: Any, pixels: Any, pixel: int, strip: Any, base: int, mix: int, 
     if opaque_count > 0:
         color = opaque_color / type(sweep.end)(opaque_count)
     elif count - first > 1:
-        color = divide(opacity, total, one) * color
+        color = wp.min(divide(opacity, total, one), type(sweep.end)(WEIGHT_LIMIT)) * color
     return color, tau, opacity_sum
 
 
@@ -147,14 +147,14 @@ def blend_adjoint(
         missing += a * (weight - one + opacity)
         opacity += tau * a
         tau *= passed
-    # Where given opacity sums leave a thin part all the say, the derivatives are beyond any use.
+    # Where opacity sums far below the opacities leave a thin part all the say, derivatives are beyond any use.
     limit = type(g_tau)(WEIGHT_LIMIT)
     # By itself a part stays as it is, and opaque parts have equal weights.
     varies = count > 1 and opaque_count == 0
     scale = type(g_tau)(1.0)
     slope = type(g_tau)(0.0)
     if varies:
-        scale = divide(opacity, total, one)
+        scale = wp.min(divide(opacity, total, one), limit)
         missing = divide(missing, total, zero)
         if mix == MIX_OPTICAL_DEPTH:
             slope = g_scale * absorption_slope(total, tau, scale)
@@ -189,7 +189,7 @@ def blend_adjoint(
                 g_passed += g_weight * by_passed
             else:
                 g_w += wp.clamp(g_weight, -limit, limit)
-                if total > type(g_tau)(NEGLIGIBLE):
+                if total > type(g_tau)(NEGLIGIBLE) and scale < limit:
                     # scale = (1 - tau) / total: its derivative is (others - weight * scale) / total.
                     others_veil = strip.veil[at] + strip.prefix[at] * suffix_veil
                     change = g_scale / total * (weight * missing - (weight - one) - others_veil)
