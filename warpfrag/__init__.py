@@ -7,8 +7,8 @@ image, and every step can be differentiated, on the CPU and on CUDA from the sam
     layers = wf.resolve(fragments, beta=0.5, max_layers=8)
     image = wf.composite(layers)
 
-`wf.render` does all of it, `wf.composite(fragments, ...)` the last two at once, `wf.fit` finds the parameters of a scene
-from an image. Arrays may be torch tensors, Warp arrays or NumPy arrays: what goes in comes out.
+`wf.render` does all of it, `wf.composite(fragments, ...)` the last two at once, `wf.fit` finds the parameters of a
+scene from an image. Arrays may be torch tensors, Warp arrays or NumPy arrays: what goes in comes out.
 """
 
 from warpfrag import baselines

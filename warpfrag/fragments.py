@@ -179,7 +179,7 @@ def _check_arrays(floats: dict[str, Any], integers: dict[str, Any], optional: tu
                 raise ValueError(f"{name}: is on {array.device}, expected {first.device} like rgba")
 
 
-def _check_shape(name: str, array: Any, expected: tuple[int, ...]) -> None:
+def _check_shape(name: str, array: Any, expected: tuple[Any, ...]) -> None:
     if array is not None and tuple(array.shape) != expected:
         raise ValueError(f"{name}: got shape {tuple(array.shape)}, expected {expected}")
 

@@ -10,7 +10,7 @@ import warp as wp
 from warpfrag.fragments import Fragments
 from warpfrag.interop.launch import Span, launch, worker_count
 from warpfrag.interop.operator import dtype_name, kind_of
-from warpfrag.operators import LOG_FLOOR, LOG_OPAQUE, MIX_AVERAGE, MIX_OPACITY, MIX_OPTICAL_DEPTH, Slab32, Slab64
+from warpfrag.operators import MIX_AVERAGE, MIX_OPACITY, MIX_OPTICAL_DEPTH
 from warpfrag.resolve.walk import (
     MERGE_EXACT,
     MERGE_NONE,
@@ -24,6 +24,7 @@ from warpfrag.resolve.walk import (
     Scratch32,
     Scratch64,
 )
+from warpfrag.slabs import LOG_FLOOR, LOG_OPAQUE, Slab32, Slab64
 
 Merge = Literal["none", "smooth", "order_independent", "exact"]
 Mix = Literal["opacity", "average", "optical_depth"]
@@ -71,9 +72,7 @@ def check_choice(name: str, value: Any, choices: Sequence[str]) -> None:
         raise ValueError(f"{name}: got {value!r}, expected one of {', '.join(map(repr, choices))}")
 
 
-def fragment_inputs(
-    fragments: Fragments, beta: Any, *, dimensions: int, by_fragment: bool = False
-) -> tuple[Any, ...]:
+def fragment_inputs(fragments: Fragments, beta: Any, *, dimensions: int, by_fragment: bool = False) -> tuple[Any, ...]:
     """Return the operator inputs `FRAGMENT_TENSORS`, for outputs of so many dimensions beside those of the grid.
 
     With `by_fragment` beta may also be one value per fragment.
@@ -175,17 +174,31 @@ class Walk:
         return array if array is not None else wp.empty((0,) * ndim, dtype=self.scalar, device=self.device)
 
     def forward(self, kernel: Callable[..., wp.Kernel], outputs: Sequence[wp.array]) -> None:
-        """Run the kernel made for the merge and mix, which takes pixels, order, length, invalid and outputs; raise if it finds invalid values."""
+        """Run the kernel made for the merge and mix: on pixels, order, length, invalid, outputs.
+
+        Raises:
+            ValueError: it found invalid values.
+        """
         rows = worker_count(self.pixel_count, self.device, 4 * self.length)
         order = wp.empty(rows * self.length, dtype=wp.int32, device=self.device)
         invalid = wp.array(np.full((rows, 2), NO_FRAGMENT, np.int32), device=self.device)
-        launch(kernel(*self.choice), self.pixel_count, [self.pixels, order, self.length, invalid, *outputs], self.device, rows)
+        launch(
+            kernel(*self.choice),
+            self.pixel_count,
+            [self.pixels, order, self.length, invalid, *outputs],
+            self.device,
+            rows,
+        )
         report_invalid(invalid, self.inputs)
 
-    def backward(self, kernel: Callable[..., wp.Kernel], grads: Sequence[wp.array], grad_inputs: Sequence[wp.array | None]) -> None:
-        """Run the kernel made for the merge and mix, which takes pixels, scratch, output gradients and input gradients."""
+    def backward(
+        self, kernel: Callable[..., wp.Kernel], grads: Sequence[wp.array], grad_inputs: Sequence[wp.array | None]
+    ) -> None:
+        """Run the kernel made for the merge and mix: on pixels, scratch, output gradients, input gradients."""
         slab = SLABS[self.scalar]
-        rows = worker_count(self.pixel_count, self.device, (8 + 21 * wp.types.type_size_in_bytes(self.scalar)) * self.length)
+        rows = worker_count(
+            self.pixel_count, self.device, (8 + 21 * wp.types.type_size_in_bytes(self.scalar)) * self.length
+        )
         scratch = SCRATCH[self.scalar]()
         scratch.length = self.length
         for name, dtype in (

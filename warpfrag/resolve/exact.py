@@ -10,8 +10,8 @@ while t > 0. The cost of a pixel is that of sorting plus one step for every pair
 The opacity of a layer is that of its fragments, 1 - prod T_i, and has a gradient in nothing else. For the colour the
 way back sweeps twice. First it records P_k, tau_k and <g, c_k>, from which follows <g, B_k>, B the colour behind. Then,
 with dL/dc_k = P_k g and dL/dtau_k = P_k <g, B_k>, it takes the adjoint of each interval. Each thread has memory for
-the fragments of one pixel. Differentiable in colour, opacity, depth, thickness, opacity sum and beta (also by fragment);
-the order of the boundaries, runs and what falls into the tail are held fixed.
+the fragments of one pixel. Differentiable in colour, opacity, depth, thickness, opacity sum and beta (also by
+fragment); the order of the boundaries, runs and what falls into the tail are held fixed.
 """
 
 from collections.abc import Callable, Sequence

@@ -18,8 +18,9 @@ from typing import Any
 
 import warp as wp
 
-from warpfrag.operators import (
-    MIX_OPTICAL_DEPTH,
+from warpfrag.operators import MIX_OPTICAL_DEPTH
+from warpfrag.resolve.sweep import cut_slab, cut_slab_adjoint, fragment_beta, light_to, part_share
+from warpfrag.slabs import (
     NEGLIGIBLE,
     SERIES_OPACITY,
     WEIGHT_LIMIT,
@@ -28,7 +29,6 @@ from warpfrag.operators import (
     divide,
     slab,
 )
-from warpfrag.resolve.sweep import cut_slab, cut_slab_adjoint, fragment_beta, light_to, part_share
 
 wp.set_module_options({"enable_backward": False})
 

@@ -14,18 +14,9 @@ from typing import Any
 
 import warp as wp
 
-from warpfrag.operators import (
-    LOG_OPAQUE,
-    NEGLIGIBLE,
-    SERIES_OPACITY,
-    Slab32,
-    Slab64,
-    divide,
-    log_transmittance,
-    optical_gain_adjoint,
-    series,
-)
+from warpfrag.operators import optical_gain_adjoint
 from warpfrag.resolve.walk import MERGE_NONE, load_slab
+from warpfrag.slabs import LOG_OPAQUE, NEGLIGIBLE, SERIES_OPACITY, Slab32, Slab64, divide, log_transmittance, series
 
 wp.set_module_options({"enable_backward": False})
 
