@@ -188,13 +188,14 @@ def blend_adjoint(
                 g_a += slope * weight + g_weight * by_a
                 g_passed += g_weight * by_passed
             else:
-                g_w += wp.clamp(g_weight, -limit, limit)
+                most = limit / wp.max(weight, one)
+                g_w += wp.clamp(g_weight, -most, most)
                 if total > type(g_tau)(NEGLIGIBLE) and scale < limit:
                     # scale = (1 - tau) / total: its derivative is (others - weight * scale) / total.
                     others_veil = strip.veil[at] + strip.prefix[at] * suffix_veil
                     change = g_scale / total * (weight * missing - (weight - one) - others_veil)
                     g_a += wp.clamp(change, -limit, limit)
-                    g_w -= wp.clamp(g_scale * scale * (a / total), -limit, limit)
+                    g_w -= wp.clamp(g_scale * scale * (a / total), -most, most)
         g_share += g_a * s.a
         # share = (rest - next_rest) / before, passed = after / before
         before = light_to(s, rest)
