@@ -14,8 +14,6 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from itertools import count
-from threading import local
 from typing import Any
 
 import warp as wp
@@ -83,15 +81,20 @@ def launch(kernel: wp.Kernel, size: int, inputs: Sequence[Any], device: wp.Devic
     # Loading a module from several threads at once is not safe. CPU kernels are launched with blocks of one.
     wp.load_module(kernel.module, device, block_dim=1)
     piece = max(SMALLEST_PIECE, -(-size // (threads * PIECES_PER_THREAD)))
-    begins = range(0, size, piece)
-    pool, slot = _pool(threads)
+    # One iterator for all: each thread takes the next piece when it is done with one.
+    begins = iter(range(0, size, piece))
 
-    def run(begin: int) -> None:
-        span = _span(begin, min(begin + piece, size), 1, slot())
-        wp.launch(kernel, dim=1, inputs=[span, *inputs], device=device, record_tape=False)
+    def work(worker: int) -> None:
+        for begin in begins:
+            span = _span(begin, min(begin + piece, size), 1, worker)
+            wp.launch(kernel, dim=1, inputs=[span, *inputs], device=device, record_tape=False)
 
-    for _ in pool.map(run, begins):
-        pass
+    others = [_pool(threads - 1).submit(work, worker) for worker in range(1, threads)]
+    try:
+        work(0)
+    finally:
+        for other in others:
+            other.result()
 
 
 def _span(begin: int, end: int, stride: int, worker: int) -> Span:
@@ -101,15 +104,8 @@ def _span(begin: int, end: int, stride: int, worker: int) -> Span:
 
 
 @cache
-def _pool(threads: int) -> tuple[ThreadPoolExecutor, Any]:
-    """Return a pool of threads, and a function that tells the calling thread its number in it."""
-    numbers = count()
-    own = local()
-
-    def take_number() -> None:
-        own.number = next(numbers)
-
-    return ThreadPoolExecutor(threads, thread_name_prefix="warpfrag", initializer=take_number), lambda: own.number
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, thread_name_prefix="warpfrag")
 
 
 if hasattr(os, "register_at_fork"):

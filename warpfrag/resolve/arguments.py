@@ -43,6 +43,9 @@ PIXELS: Any = {wp.float32: Pixels32, wp.float64: Pixels64}
 GRADIENTS: Any = {wp.float32: Gradients32, wp.float64: Gradients64}
 SCRATCH: Any = {wp.float32: Scratch32, wp.float64: Scratch64}
 
+# Unused entries between the rows of scratch memory: two threads that write the same cache line slow each other down.
+ROW_GAP = 32
+
 # Tensors and options that operators on fragments share, in this order.
 FRAGMENT_TENSORS = ("rgba", "depth", "thickness", "offsets", "beta", "opacity_sum")
 FRAGMENT_DIFFERENTIABLE = ("rgba", "depth", "thickness", "beta", "opacity_sum")
@@ -145,7 +148,7 @@ def vectors(array: wp.array) -> wp.array:
 class Walk:
     """One launch of a kernel that walks through every pixel's fragments, and the memory it needs.
 
-    Scratch memory has a row for each thread that runs at the same time, as long as the longest list of fragments.
+    Scratch memory has a row for each thread that runs at the same time, of `row_length`.
     """
 
     def __init__(self, inputs: Sequence[Any], max_layers: int, merge: str, mix: str):
@@ -155,7 +158,7 @@ class Walk:
         self.scalar = rgba.dtype
         self.device = rgba.device
         self.pixel_count = offsets.shape[0] - 1
-        self.length = max(1, longest_list(offsets, rgba.shape[0]))
+        self.length = row_length(offsets, rgba.shape[0])
         self.pixels = PIXELS[self.scalar]()
         self.pixels.rgba = vectors(rgba)
         self.pixels.depth = depth
@@ -231,13 +234,15 @@ class Walk:
 @wp.kernel(module="unique", enable_backward=False)
 def list_extent(span: Span, offsets: wp.array[int], fragment_count: int, extent: wp.array2d[int]):
     """Find the longest list; a list that ends before it begins or beyond the fragments is reported by its pixel."""
+    longest = int(0)
     for pixel in range(span.begin + wp.tid(), span.end, span.stride):
         begin = offsets[pixel]
         end = offsets[pixel + 1]
         if begin < 0 or end < begin or end > fragment_count:
             wp.atomic_min(extent, span.worker, 1, pixel)
         else:
-            wp.atomic_max(extent, span.worker, 0, end - begin)
+            longest = wp.max(longest, end - begin)
+    wp.atomic_max(extent, span.worker, 0, longest)
 
 
 def longest_list(offsets: wp.array, fragment_count: int) -> int:
@@ -248,9 +253,9 @@ def longest_list(offsets: wp.array, fragment_count: int) -> int:
     """
     pixel_count = offsets.shape[0] - 1
     device = offsets.device
-    rows = worker_count(pixel_count, device, 0) if device.is_cpu else 1
-    extent = wp.array(np.tile(np.array([0, NO_FRAGMENT], np.int32), (rows, 1)), device=device)
-    launch(list_extent, pixel_count, [offsets, fragment_count, extent], device)
+    extent = wp.array(np.array([[0, NO_FRAGMENT]], np.int32), device=device)
+    # A nanosecond a pixel: less than it takes to wake another thread.
+    launch(list_extent, pixel_count, [offsets, fragment_count, extent], device, workers=1 if device.is_cpu else None)
     found = extent.numpy()
     pixel = int(found[:, 1].min())
     if pixel != NO_FRAGMENT:
@@ -262,6 +267,11 @@ def longest_list(offsets: wp.array, fragment_count: int) -> int:
     if first != 0 or last != fragment_count:
         raise ValueError(f"offsets: run from {first} to {last}, expected from 0 to the {fragment_count} fragments")
     return int(found[:, 0].max())
+
+
+def row_length(offsets: wp.array, fragment_count: int) -> int:
+    """Return the length of a thread's row of scratch memory: the longest list of fragments, and a gap."""
+    return longest_list(offsets, fragment_count) + ROW_GAP
 
 
 def report_invalid(invalid: wp.array, inputs: Sequence[Any], beta_per: str = "pixel") -> None:

@@ -27,6 +27,7 @@ from warpfrag.resolve.arguments import (
     fragment_inputs,
     longest_list,
     report_invalid,
+    row_length,
     vectors,
 )
 from warpfrag.resolve.members import ZERO, Members, layer_of, member_adjoint, no_members, with_member
@@ -201,7 +202,7 @@ def kbuffer_backward(
     """Fill those gradients of the fragments that are not None, given those of the layers."""
     rgba, _, _, offsets, _ = inputs
     scalar, device, pixel_count = rgba.dtype, rgba.device, offsets.shape[0] - 1
-    length = max(1, longest_list(offsets, rgba.shape[0]))
+    length = row_length(offsets, rgba.shape[0])
     rows = worker_count(pixel_count, device, 4 * length + slots * (7 * wp.types.type_size_in_bytes(scalar) + 92))
     sizes = zip(LAYER_OUTPUTS, layers_like(rows, slots), strict=True)
     scratch = slots_in(
