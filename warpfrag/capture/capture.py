@@ -128,8 +128,8 @@ def fragments_of_rows(surfaces: Surfaces, triangles: Triangles, starts: wp.array
 def capture(
     scene: Scene,
     camera: Camera | None = None,
-    *,
     sort: bool = True,
+    *,
     parameters: Mapping[str, Any] | None = None,
     rows: tuple[int, int] | None = None,
     memory_limit: float | None = None,

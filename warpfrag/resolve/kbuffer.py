@@ -242,7 +242,7 @@ _KBUFFER = Operator(
 )
 
 
-def kbuffer(fragments: Fragments, slots: int = 8, *, merge: KMerge = "order_independent", tail: Tail = "mix") -> Layers:
+def kbuffer(fragments: Fragments, slots: int = 8, merge: KMerge = "order_independent", tail: Tail = "mix") -> Layers:
     """Stream the fragments of every pixel, in the order in which they are given, into a k-buffer.
 
     This is what a renderer that cannot store all fragments would make of them (SKB, with merging SKB+OFM): it merges

@@ -220,7 +220,6 @@ _RESOLVE = Operator(
 def resolve(
     fragments: Fragments,
     beta: Any = 1.0,
-    *,
     max_layers: int = 8,
     merge: Merge = "smooth",
     mix: Mix = "opacity",
