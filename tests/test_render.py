@@ -1,5 +1,7 @@
 """From a scene to its image: options, background, gradients, and bands of rows under a memory limit."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -8,9 +10,13 @@ from capture_scenes import orthographic, perspective, quad, scene, soup, surface
 from warpfrag.capture import memory
 from warpfrag.capture import render as render_module
 from warpfrag.capture.capture import capture
+from warpfrag.capture.precision import z_resolution
 from warpfrag.capture.render import render
 from warpfrag.composite import composite
+from warpfrag.scene.files import load_scene
 from warpfrag.scene.primitives import sphere
+
+SCENES = Path(__file__).parents[1] / "scenes"
 
 
 def crowd(size=(40, 36), **options):
@@ -224,3 +230,29 @@ def test_arguments_are_checked():
         render(setting, beta=np.zeros((3, 3)))
     with pytest.raises(ValueError, match="unknown name"):
         render(setting, parameters={"soup.thicknes": 1.0})
+
+
+def test_coplanar_cubes_show_speckle_only_without_merging():
+    """Where the cubes share faces rounding decides which is in front: colours flip between pixels, unless merged."""
+    scene = load_scene(SCENES / "coplanar_cubes.toml")
+    camera = scene.camera.resized((256, 256))
+    fragments = capture(scene, camera)
+    begins, ends = fragments.offsets[:-1], fragments.offsets[1:]
+    first = np.minimum(begins, fragments.count - 2)
+    closer = np.diff(fragments.depth)[first] < 2.0 * z_resolution(fragments.depth[first], camera.near, camera.far)
+    differ = fragments.object_id[first] != fragments.object_id[first + 1]
+    shared = ((ends - begins >= 2) & closer & differ).reshape(256, 256)
+    assert shared.sum() > 5000
+
+    def sign_changes(merge):
+        # Red or blue in front: against the mean of the row's neighbours, so that shading and edges do not count.
+        image = render(scene, camera, merge=merge)
+        redness = image[..., 0] - image[..., 2]
+        excess = redness[:, 1:-1] - 0.5 * (redness[:, 2:] + redness[:, :-2])
+        inside = shared[:, 1:-1] & shared[:, 2:] & shared[:, :-2]
+        signs = np.where(inside & (np.abs(excess) > 0.02), np.sign(excess), 0.0)
+        return int((signs[:, 1:] * signs[:, :-1] < 0.0).sum())
+
+    assert sign_changes("none") > 100
+    # What is left are a few pixels on edges of the cubes' far sides.
+    assert sign_changes("smooth") < 0.05 * sign_changes("none")
