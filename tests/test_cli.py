@@ -2,10 +2,12 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,7 @@ import pytest
 from test_study import SCENE
 
 from warpfrag.cli import main
+from warpfrag.fit.summary import BEGIN, END
 from warpfrag.images import read_image
 
 STUDY = """
@@ -92,6 +95,14 @@ MISTAKES = [
     (["fit", "none.toml"], "none.toml: found no such file"),
     (["fit", "study.toml", "--steps", "0"], "steps: found 0"),
     (["fit", "study.toml", "--resume"], "found no checkpoint to resume"),
+    (["fit"], "fit: found neither STUDY nor --all"),
+    (["fit", "study.toml", "--all"], "fit: found both STUDY and --all"),
+    (["fit", "study.toml", "--from", "."], "--from: found it without --all"),
+    (["fit", "--all"], "experiments/fit: found no such folder"),
+    (["fit", "--all", "--from", "."], "found no study, expected folders with a study.py"),
+    (["fit", "--all", "--size", "8x8"], "--size: found it with --all"),
+    (["fit", ".", "--resume"], "--resume: found it with ., expected it with a study file only"),
+    (["fit", "."], "found no study.py in it"),
 ]
 
 
@@ -139,6 +150,26 @@ def test_fit_writes_its_folder(folder, capsys):
     assert content["true"]["ball.color"] == pytest.approx([0.2, 0.4, 0.6])
 
 
+def test_fit_logs_to_tensorboard(folder, capsys, monkeypatch):
+    """--tensorboard logs every step, beside the bar, and closes the log."""
+    told = []
+
+    class Board:
+        def __init__(self, path):
+            told.append(path)
+
+        def __enter__(self):
+            return lambda progress: told.append(progress.step)
+
+        def __exit__(self, *error):
+            told.append("closed")
+
+    # By name it is not found: `warpfrag.fit` is a function to those who ask the package for it.
+    monkeypatch.setattr(import_module("warpfrag.fit.tensorboard"), "TensorBoard", Board)
+    assert main(["fit", "study.toml", "--steps", "3", "--size", "12x8", "--tensorboard"]) == 0
+    assert told == [Path("results/study/tensorboard"), 1, 2, 3, "closed"]
+
+
 def start(*words: str) -> subprocess.Popen:
     """Start the command line in a process of its own."""
     command = [sys.executable, "-m", "warpfrag.cli", *words]
@@ -177,3 +208,115 @@ def test_interrupted_and_killed_fit_ends_at_the_same_bits(folder):
     assert len(results[1]["losses"]) == 150
     assert results[0]["losses"][:150] == results[1]["losses"]
     assert not list(folder.glob("**/.*partial*"))
+
+
+GOOD = """
+from pathlib import Path
+from warpfrag.fit.summary import Summary
+print("measuring")
+Summary("good", "Good", "Is it?", "It is 1.5.").save(Path(__file__).parent)
+"""
+# In the words of summary.json, as the package takes its time to import.
+BRIEF = """
+import json, pathlib
+folder = pathlib.Path("results/fit/brief")
+(folder / "summary.json").write_text(json.dumps(dict(name="brief", title="Brief", question="?", answer="Yes.")))
+"""
+FAILING = """
+import sys
+print("a line")
+try:
+    raise KeyError("first")
+except KeyError:
+    raise ValueError("found 3, expected 4\\nand more")
+"""
+SLEEPING = """
+import pathlib, time
+pathlib.Path("started").touch()
+try:
+    time.sleep(600)
+finally:
+    pathlib.Path("ended").touch()
+"""
+
+
+def add_study(script: str, folder: Path) -> None:
+    """Make a study's folder."""
+    folder.mkdir(parents=True)
+    (folder / "study.py").write_text(script)
+    (folder / "README.md").write_text(f"# A study\n\n{BEGIN}\n{END}\n")
+
+
+def test_fit_all_runs_every_study(folder, capsys):
+    """Each study has a line and a row in the report, in the order of their names; status 1 if one failed."""
+    studies = folder / "experiments" / "fit"
+    scripts = {"good": GOOD, "failing": FAILING, "silent": "", "killed": "import os; os.kill(os.getpid(), 9)"}
+    for name, script in scripts.items():
+        add_study(script, studies / name)
+    (studies / "no_study").mkdir()
+    assert main(["fit", "--all"]) == 1
+    captured = capsys.readouterr()
+    first, last = captured.out.splitlines()
+    assert first.startswith("good: It is 1.5. (")
+    assert last == "report in results/fit/report.html"
+    told = [line for line in captured.err.splitlines() if line.startswith("warpfrag: ")]
+    assert told == [
+        "warpfrag: failing: ValueError: found 3, expected 4 (more in results/fit/failing/log.txt)",
+        "warpfrag: killed: study.py was ended by SIGKILL (more in results/fit/killed/log.txt)",
+        "warpfrag: silent: found no new results/fit/silent/summary.json, expected study.py to save a Summary"
+        " (more in results/fit/silent/log.txt)",
+    ]
+    assert (folder / "results" / "fit" / "good" / "log.txt").read_text() == "measuring\n"
+    assert "It is 1.5." in (studies / "good" / "README.md").read_text()
+    text = (folder / "results" / "fit" / "report.html").read_text()
+    assert re.findall(r"ValueError: found 3, expected 4|ended by SIGKILL|found no new results|It is 1.5", text) == [
+        "ValueError: found 3, expected 4",
+        "It is 1.5",
+        "ended by SIGKILL",
+        "found no new results",
+        "It is 1.5",
+    ]
+
+
+def test_fit_all_from_another_folder(folder, capsys):
+    """--from names the studies' folder, --output that of the report; status 0 if all went well."""
+    add_study(BRIEF, folder / "elsewhere" / "brief")
+    assert main(["fit", "--all", "--from", "elsewhere", "-o", "out"]) == 0
+    assert "Yes." in (folder / "out" / "report.html").read_text()
+
+
+def test_fit_runs_a_study_folder(folder, capsys):
+    """A folder with a study.py is run alone, and its report is with its results."""
+    add_study(BRIEF, folder / "brief")
+    assert main(["fit", "brief"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "report in results/fit/brief/report.html"
+    assert "Yes." in (folder / "results" / "fit" / "brief" / "report.html").read_text()
+
+
+def test_old_summary_does_not_count(folder, capsys):
+    """A study that writes no summary has failed, though one of an earlier run is there."""
+    add_study(BRIEF, folder / "brief")
+    assert main(["fit", "brief"]) == 0
+    (folder / "brief" / "study.py").write_text("")
+    assert main(["fit", "brief"]) == 1
+    assert "found no new" in capsys.readouterr().err
+
+
+def test_module_is_the_command_line(folder):
+    """`python -m warpfrag` does what `warpfrag` does."""
+    run = subprocess.run([sys.executable, "-m", "warpfrag", "--version"], capture_output=True, text=True, check=True)
+    assert run.stdout.startswith("warpfrag ")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals are those of POSIX")
+def test_interrupted_fit_all_stops_the_study(folder):
+    """Ctrl-C reaches the study once; no report is written."""
+    add_study(SLEEPING, folder / "studies" / "sleeping")
+    process = start("fit", "--all", "--from", "studies")
+    wait_for(folder / "started", process)
+    process.send_signal(signal.SIGINT)
+    _, told = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert told.splitlines()[-1] == "warpfrag: stopped in sleeping (1 of 1); the report is not written"
+    assert (folder / "ended").exists()
+    assert not list(folder.glob("**/report.html"))

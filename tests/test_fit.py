@@ -13,7 +13,7 @@ from warpfrag.fit import FitError, FitParameter, FitResult, Reference, Study, St
 from warpfrag.fit import problem as problem_module
 from warpfrag.fit.jacobian import Evaluation
 from warpfrag.fit.losses import RobustLoss
-from warpfrag.fit.problem import FrozenGeometry, Problem
+from warpfrag.fit.problem import Problem, ViewProblem
 from warpfrag.images import read_image, write_image
 from warpfrag.scene.objects import SceneObject
 from warpfrag.scene.primitives import plane
@@ -28,19 +28,17 @@ def make_study(parameters=None, *, true=None, scene=None, **options) -> Study:
     return Study(scene or spheres(), Reference(true=true or {}), parameters or STARTS, **options)
 
 
-def pixel_of_each(problem: Problem) -> np.ndarray:
-    """Return the pixel of each fragment."""
-    counts = np.diff(problem.frozen.fragments.offsets)
-    return np.repeat(np.arange(counts.size), counts)
-
-
 @pytest.mark.parametrize("background", [(0.0, 0.0, 0.0, 0.0), (0.4, 0.3, 0.2, 0.5)])
 def test_frozen_geometry_renders_the_same_image(background):
     """The scene captured once with ones, then scaled, is the scene rendered with the values, to rounding."""
     problem = Problem(make_study(EVERYTHING, scene=replace(spheres(), background=background)))
     values = problem.values(problem.start())
-    whole = render(problem.scene, parameters={name: np.float32(value) for name, value in values.items()})
-    np.testing.assert_allclose(problem.image(values), whole, atol=2e-6)
+    whole = render(problem.views[0].scene, parameters={name: np.float32(value) for name, value in values.items()})
+    view = problem.views[0]
+    np.testing.assert_allclose(view.image(values), whole, atol=0.0)
+    scaled = view.unit.scaled(view.parameters(values), problem.study.variables)
+    image = view.over_background(view.composite(scaled, np.float32(0.4)))
+    np.testing.assert_allclose(image, whole, atol=2e-6)
 
 
 def test_jacobian_is_that_of_differences():
@@ -49,14 +47,13 @@ def test_jacobian_is_that_of_differences():
     problem = Problem(make_study(EVERYTHING, scene=scene))
     loss = RobustLoss.named("l2", 1.0)
     start = problem.start()
-    middle = Evaluation(problem, loss, start)
-    pixels = pixel_of_each(problem)
-    jacobian = np.stack([middle.channel(channel, pixels) for channel in range(4)], axis=1)
+    middle = Evaluation(problem, loss, start).views[0]
+    jacobian = np.stack([middle.channel(channel) for channel in range(4)], axis=1).reshape(36, 40, 4, -1)
     # Rounding of float32 (1e-7) over the step, and the square of the step, both stay below the tolerance.
     step, tolerance = 2e-3, 5e-4
     for column in range(start.size):
         shift = step * np.eye(start.size)[column]
-        up, down = (Evaluation(problem, loss, start + sign * shift).residual for sign in (1, -1))
+        up, down = (Evaluation(problem, loss, start + sign * shift).views[0].residual for sign in (1, -1))
         ahead, behind = (up - middle.residual) / step, (middle.residual - down) / step
         # Where slabs begin to overlap SFM has kinks and jumps: there differences mean nothing.
         smooth = np.abs(ahead - behind) < 5e-3
@@ -72,8 +69,9 @@ def test_compressed_rows_keep_the_normal_equations(name):
     loss = RobustLoss.named(name, 0.05)
     evaluation = Evaluation(problem, loss, problem.start())
     compressed = evaluation.compress()
-    jacobian = np.concatenate([evaluation.channel(channel, pixel_of_each(problem)) for channel in range(4)])
-    residual = evaluation.residual.T.reshape(-1)
+    view = evaluation.views[0]
+    jacobian = np.concatenate([view.channel(channel) for channel in range(4)])
+    residual = np.moveaxis(view.residual, 2, 0).reshape(-1)
     weight = loss.weight(residual)
     first = np.zeros(len(compressed.jacobian))
     first[0] = np.sqrt(compressed.cost)
@@ -123,7 +121,7 @@ def test_least_squares_recovers_opacity_and_color():
 def test_standard_errors_are_those_of_repeated_fits():
     """Found values scatter by the standard errors when the reference has noise."""
     study = make_study({"beta": 0.5, "red.thickness": 0.3})
-    clean = Problem(study).reference
+    clean = Problem(study).views[0].reference
     generator = np.random.default_rng(5)
     found, predicted = [], []
     for _ in range(12):
@@ -291,16 +289,16 @@ def test_nan_in_the_loss_stops(method, monkeypatch):
 @pytest.mark.parametrize("method", ["adam", "lbfgs"])
 def test_nan_in_a_gradient_stops(method, monkeypatch):
     """A gradient that is not finite stops with the step and the parameter's name."""
-    original = FrozenGeometry.scaled
+    original = ViewProblem.image
 
     def poisoned(self, values):
-        fragments, value = original(self, values), values["green.thickness"]
+        image, value = original(self, values), values["green.thickness"]
         if not isinstance(value, torch.Tensor):
-            return fragments
+            return image
         # The slope of the root at 0 is infinite, and 0 times infinity is NaN.
-        return replace(fragments, thickness=fragments.thickness + (value - value.detach()).sqrt() * 0.0)
+        return image + (value - value.detach()).sqrt() * 0.0
 
-    monkeypatch.setattr(FrozenGeometry, "scaled", poisoned)
+    monkeypatch.setattr(ViewProblem, "image", poisoned)
     with pytest.raises(FitError, match=r"step 1: the gradient in green\.thickness is not finite"):
         fit(make_study(method=method))
 
@@ -348,7 +346,7 @@ def test_reference_with_opacity_is_laid_over_the_background():
     scene = spheres()
     image = render(scene, background=False)
     problem = Problem(Study(scene, Reference(image=image), STARTS))
-    np.testing.assert_allclose(problem.reference, render(scene), atol=1e-6)
+    np.testing.assert_allclose(problem.views[0].reference, render(scene), atol=1e-6)
 
 
 def test_supersampled_reference():
@@ -356,7 +354,7 @@ def test_supersampled_reference():
     study = Study(spheres(), Reference(true={}, supersampling=2, merge="none"), STARTS)
     large = replace(spheres(size=(80, 72)), merge="none")
     mean = render(large).reshape(36, 2, 40, 2, 4).mean(axis=(1, 3))
-    np.testing.assert_allclose(Problem(study).reference, mean, atol=1e-6)
+    np.testing.assert_allclose(Problem(study).views[0].reference, mean, atol=1e-6)
 
 
 def test_restarts_keep_the_best(monkeypatch):

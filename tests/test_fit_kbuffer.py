@@ -27,8 +27,9 @@ def test_image_is_that_of_the_bounded_capture():
     problem = Problem(study)
     values = {name: np.float32(value) for name, value in problem.values(problem.start()).items()}
     layers = wf.capture_kbuffer(study.scene, slots=3, parameters=values)
-    image = problem.over_background(wf.composite(layers))
-    np.testing.assert_allclose(problem.image(values), image, atol=2e-6)
+    view = problem.views[0]
+    image = view.over_background(wf.composite(layers))
+    np.testing.assert_allclose(view.image(values), image, atol=2e-6)
     assert np.abs(image - wf.render(study.scene, parameters=values)).max() > 0.01
 
 
@@ -37,13 +38,12 @@ def test_jacobian_is_that_of_differences(merge):
     """Colour and opacity change no merge tree: every column is the central difference of the image."""
     problem = Problem(make_study(merge=merge))
     loss, start = RobustLoss.named("l2", 1.0), problem.start()
-    middle = Evaluation(problem, loss, start)
-    counts = np.diff(problem.frozen.fragments.offsets)
-    pixels = np.repeat(np.arange(counts.size), counts)
-    jacobian = np.stack([middle.channel(channel, pixels) for channel in range(4)], axis=1)
+    middle = Evaluation(problem, loss, start).views[0]
+    jacobian = np.stack([middle.channel(channel) for channel in range(4)], axis=1)
+    jacobian = jacobian.reshape(*middle.residual.shape, -1)
     for column in range(start.size):
         shift = 2e-3 * np.eye(start.size)[column]
-        up, down = (Evaluation(problem, loss, start + sign * shift).residual for sign in (1, -1))
+        up, down = (Evaluation(problem, loss, start + sign * shift).views[0].residual for sign in (1, -1))
         assert np.abs(jacobian[..., column]).max() > 0.02
         # Rounding of float32 over the step, and its square.
         np.testing.assert_allclose(jacobian[..., column], (up - down) / 4e-3, atol=2e-4)

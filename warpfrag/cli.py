@@ -8,7 +8,8 @@ import os
 import re
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -17,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
+    from warpfrag.fit.session import Progress
     from warpfrag.scene.objects import Scene, SceneObject
 
 app = typer.Typer(
@@ -149,15 +151,47 @@ def render(
 
 @app.command()
 def fit(
-    study: Annotated[Path, typer.Argument(metavar="STUDY.toml", help="The study.", show_default=False)],
+    study: Annotated[
+        Path | None,
+        typer.Argument(metavar="[STUDY]", help="A study file, or a folder with a study.py.", show_default=False),
+    ] = None,
+    every: Annotated[bool, typer.Option("--all", help="Run every study's folder and write one report.")] = False,
+    source: Annotated[
+        Path | None, typer.Option("--from", metavar="DIR", help="Folder of --all's studies [experiments/fit].")
+    ] = None,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="DIR", help="Folder of the results [results/STUDY].")
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="DIR",
+            help="Folder of the results [results/STUDY], or of the report [results/fit].",
+        ),
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in the folder.")] = False,
     steps: Annotated[int | None, typer.Option(help="Most steps, in place of the study's.")] = None,
     size: SizeOption = None,
+    tensorboard: Annotated[
+        bool, typer.Option("--tensorboard", help="Log each step to the folder tensorboard in that of the results.")
+    ] = False,
 ) -> None:
-    """Fit the parameters of a scene to an image; write images, plots, result.json and a checkpoint to a folder."""
+    """Fit the parameters of a scene to an image; write images, plots, result.json and a checkpoint to a folder.
+
+    With --all, or a folder in place of a study file, whole studies run: each rewrites the numbers of its README, and
+    report.html shows them all.
+    """
+    if every == (study is not None):
+        found = "both STUDY and" if every else "neither STUDY nor"
+        raise UsageError(f"fit: found {found} --all, expected one of them")
+    if source is not None and not every:
+        raise UsageError("--from: found it without --all, expected both")
+    if study is None or study.is_dir():
+        given = {"--resume": resume, "--steps": steps, "--size": size, "--tensorboard": tensorboard}
+        for option, value in given.items():
+            if value not in (None, False):
+                raise UsageError(f"{option}: found it with {study or '--all'}, expected it with a study file only")
+        _run_studies(study, source, output)
+        return
     _quiet()
     from warpfrag.fit import fit as fit_study
     from warpfrag.fit import load_study
@@ -168,16 +202,71 @@ def fit(
         wanted = replace(wanted, steps=steps)
     folder = output if output is not None else Path("results") / wanted.name
     try:
-        result = fit_study(wanted, resume=resume, output=folder, progress=True)
+        with _logged(wanted.name, folder / "tensorboard" if tensorboard else None) as progress:
+            result = fit_study(wanted, resume=resume, output=folder, progress=progress)
     except KeyboardInterrupt:
         if not (folder / CHECKPOINT).is_file():
             raise typer.Exit(_complain("stopped before the first checkpoint", 130)) from None
         again = f"warpfrag fit {study}" + (f" -o {output}" if output else "") + (f" --size {size}" if size else "")
-        again += f" --steps {steps}" if steps is not None else ""
+        again += (f" --steps {steps}" if steps is not None else "") + (" --tensorboard" if tensorboard else "")
         raise typer.Exit(_complain(f"stopped; go on with: {again} --resume", 130)) from None
     for line in result.lines():
         print(line)
     print(f"results in {folder}")
+
+
+@contextmanager
+def _logged(name: str, log: Path | None) -> "Iterator[Callable[[Progress], None] | bool]":
+    """Yield what a fit reports to: its own progress bar, or one and a TensorBoard log."""
+    if log is None:
+        yield True
+        return
+    from warpfrag.fit.bar import progress_bar
+    from warpfrag.fit.tensorboard import TensorBoard
+
+    with TensorBoard(log) as board, progress_bar(name) as bar:
+
+        def show(progress: "Progress") -> None:
+            bar(progress)
+            board(progress)
+
+        yield show
+
+
+def _run_studies(study: Path | None, source: Path | None, output: Path | None) -> None:
+    """Run a study's folder, or all, and write the report; status 1 if a study failed."""
+    from warpfrag.fit.gallery import duration, write_gallery
+    from warpfrag.fit.studies import LOG, SCRIPT, STUDIES, display, find_studies, run_study
+    from warpfrag.fit.summary import RESULTS
+
+    if study is None:
+        folders, target = find_studies(source or STUDIES), output or RESULTS
+    elif (study / SCRIPT).is_file():
+        folders, target = [study], output or RESULTS / study.resolve().name
+    else:
+        raise UsageError(f"{study}: found no {SCRIPT} in it, expected a study's folder or a study file")
+    # That it cannot be written is to be known before the studies have run.
+    target.mkdir(parents=True, exist_ok=True)
+    runs = []
+    for number, folder in enumerate(folders, start=1):
+        words = f"{folder.resolve().name} ({number} of {len(folders)})"
+        try:
+            with display(words) as show:
+                run = run_study(folder, show)
+        except KeyboardInterrupt:
+            raise typer.Exit(_complain(f"stopped in {words}; the report is not written", 130)) from None
+        runs.append(run)
+        if run.summary is not None:
+            print(f"{run.name}: {run.summary.answer} ({duration(run.seconds)})")
+        else:
+            _complain(f"{run.name}: {run.error} (more in {RESULTS / run.name / LOG})", 1)
+    shown = write_gallery(runs, target / "report.html")
+    for run, before in zip(shown, runs, strict=True):
+        if run is not before:
+            _complain(f"{run.name}: {run.error}", 1)
+    print(f"report in {target / 'report.html'}")
+    if any(run.error for run in shown):
+        raise typer.Exit(1)
 
 
 @app.command()

@@ -18,12 +18,13 @@ from warpfrag.capture.raster import (
     store_fragments,
 )
 from warpfrag.capture.ray import Window
-from warpfrag.capture.shade_adjoint import SHADE
+from warpfrag.capture.shade_adjoint import SHADE, SHADE_COVERED
 from warpfrag.fragments import Fragments
 from warpfrag.interop.operator import apply, kind_of
 from warpfrag.scene.camera import Camera
 from warpfrag.scene.geometry import Geometry, assemble
 from warpfrag.scene.objects import Scene
+from warpfrag.scene.pose import move_camera
 
 
 @dataclass(frozen=True)
@@ -70,13 +71,15 @@ def place_surfaces(geometry: Geometry, camera: Camera) -> Surfaces:
     """Take a scene's geometry from world to camera space, and its tables to the device of its arrays."""
     device = wp.get_device(str(geometry.vertices.device)) if kind_of(geometry.vertices) == "torch" else "cpu"
     mapped = sorted(geometry.thickness_maps)
+    # One map for all objects is there once.
+    distinct = list({id(geometry.thickness_maps[item]): geometry.thickness_maps[item] for item in mapped}.values())
+    rows = {id(each): row for row, each in enumerate(distinct)}
     maps = None
     if mapped:
-        stack = _namespace(geometry.vertices).stack([geometry.thickness_maps[item] for item in mapped])
-        maps = stack.reshape((len(mapped), camera.shape[0] * camera.shape[1]))
+        maps = _namespace(geometry.vertices).stack(distinct).reshape((len(distinct), camera.shape[0] * camera.shape[1]))
     objects = np.full((len(geometry.thickness_in_p), 3), -1, np.int32)
     objects[:, 0] = geometry.first_face[:-1]
-    objects[mapped, 1] = range(len(mapped))
+    objects[mapped, 1] = [rows[id(geometry.thickness_maps[item])] for item in mapped]
     objects[:, 2] = geometry.thickness_in_p
     tables: list[Any] = [geometry.object_id, objects, None, None, None, None]
     if geometry.uv is not None and len(geometry.textures):
@@ -85,7 +88,7 @@ def place_surfaces(geometry: Geometry, camera: Camera) -> Surfaces:
         texels = np.concatenate([image.reshape(-1, 4) for image in geometry.textures]).astype(np.float32)
         tables[2:] = geometry.uv, geometry.texture_id, texels, np.column_stack([begins, sizes]).astype(np.int32)
     return Surfaces(
-        points=to_camera_space(geometry.vertices, camera),
+        points=to_camera_space(geometry.vertices, camera, geometry.camera_pose),
         rgba=geometry.rgba,
         thickness=geometry.thickness,
         maps=maps,
@@ -94,10 +97,15 @@ def place_surfaces(geometry: Geometry, camera: Camera) -> Surfaces:
     )
 
 
-def to_camera_space(vertices: Any, camera: Camera) -> Any:
+def to_camera_space(vertices: Any, camera: Camera, pose: tuple[Any, Any] | None = None) -> Any:
     """Return world vertices in camera space, computed in float64 whatever their precision; differentiable in torch.
 
     Component by component, so that NumPy and torch round alike.
+
+    Args:
+        vertices: world space [scene units], (V, 3), NumPy or torch.
+        camera: where from.
+        pose: translation and rotation of the camera in its own axes, see `warpfrag.scene.pose`; None where it stays.
     """
     view = camera.view_matrix()
     xp = _namespace(vertices)
@@ -105,24 +113,72 @@ def to_camera_space(vertices: Any, camera: Camera) -> Any:
     x, y, z = double[:, 0], double[:, 1], double[:, 2]
     # Python's own floats: torch would turn NumPy's into arrays.
     rows = [[float(value) for value in row] for row in view[:3]]
-    points = xp.stack([row[0] * x + row[1] * y + row[2] * z + row[3] for row in rows], 1)
+    coordinates = [row[0] * x + row[1] * y + row[2] * z + row[3] for row in rows]
+    points = xp.stack(coordinates if pose is None else move_camera(coordinates, *pose), 1)
     return points.astype(vertices.dtype) if xp is np else points.to(vertices.dtype)
+
+
+def count_within(surfaces: Surfaces, window: Window, memory_limit: float | None) -> tuple[Triangles, wp.array, int]:
+    """Return the triangles of some rows, where each pixel's fragments begin, and how many there are.
+
+    Raises:
+        MemoryError: there are more than the limit allows.
+    """
+    triangles = surfaces.triangles(window)
+    allowed = allowed_memory(memory_limit, triangles.device)
+    starts, total = scan_counts(count_fragments(triangles))
+    gradient = surfaces.differentiable
+    needed = fixed_bytes(triangles, gradient) + total * fragment_bytes(triangles.points.dtype, gradient)
+    if needed > allowed:
+        refuse(needed, allowed, f"{total} fragments")
+    return triangles, starts, total
+
+
+def faces_of_fragments(triangles: Triangles, starts: wp.array, total: int, sort: bool) -> wp.array:
+    """Store and sort what `scan_counts` has counted, as the triangle of each fragment; turns `starts` into offsets."""
+    faces, depths = store_fragments(triangles, starts, total, sort)
+    sort_fragments(starts, faces, depths)
+    return faces
+
+
+def shade_fragments(
+    surfaces: Surfaces,
+    window: Window,
+    corners: wp.array,
+    faces: wp.array,
+    offsets: wp.array,
+    covered: wp.array | None = None,
+) -> Fragments:
+    """Shade fragments whose triangles are known.
+
+    Args:
+        surfaces: what to interpolate.
+        window: the pixels.
+        corners: of each triangle, in the order in which `prepare_triangles` put them, (N, 3) int32.
+        faces: triangle of each fragment, (F,) int32.
+        offsets: see `Fragments`.
+        covered: where the vertices were when coverage was found, (V, 3) float64, if not where they are now.
+    """
+    like = surfaces.points
+    own_offsets = as_kind(offsets, like)
+    inputs = (
+        *(like, surfaces.rgba, surfaces.thickness, surfaces.maps),
+        *(as_kind(corners, like), as_kind(faces, like), own_offsets, *surfaces.tables),
+    )
+    options = asdict(window)
+    if covered is None:
+        outputs = apply(SHADE, inputs, **options)
+    else:
+        outputs = apply(SHADE_COVERED, (*inputs, as_kind(covered, like)), **options)
+    rgba, depth, thickness, object_id, primitive_id = outputs
+    shape = (window.row_count, window.width)
+    return Fragments(rgba, depth, thickness, own_offsets, shape, object_id=object_id, primitive_id=primitive_id)
 
 
 def fragments_of_rows(surfaces: Surfaces, triangles: Triangles, starts: wp.array, total: int, sort: bool) -> Fragments:
     """Store, sort and shade what `scan_counts` has counted; turns `starts` into offsets."""
-    window = triangles.window
-    faces, depths = store_fragments(triangles, starts, total, sort)
-    sort_fragments(starts, faces, depths)
-    del depths
-    offsets = as_kind(starts, surfaces.points)
-    inputs = (
-        *(surfaces.points, surfaces.rgba, surfaces.thickness, surfaces.maps),
-        *(as_kind(triangles.corners, surfaces.points), as_kind(faces, surfaces.points), offsets, *surfaces.tables),
-    )
-    rgba, depth, thickness, object_id, primitive_id = apply(SHADE, inputs, **asdict(window))
-    shape = (window.row_count, window.width)
-    return Fragments(rgba, depth, thickness, offsets, shape, object_id=object_id, primitive_id=primitive_id)
+    faces = faces_of_fragments(triangles, starts, total, sort)
+    return shade_fragments(surfaces, triangles.window, triangles.corners, faces, starts)
 
 
 def capture(
@@ -137,15 +193,18 @@ def capture(
     """Capture every surface that a pixel's ray meets as a fragment (the dynamic fragment buffer).
 
     A triangle covers a pixel if the pixel's centre lies in its projection: by the top-left rule on edges, from both
-    sides, between the near and far planes. Differentiable in vertices, colour, opacity and thickness; which pixels a
-    triangle covers, the order of the fragments and the texels that a lookup takes are held fixed.
+    sides, between the near and far planes. Differentiable in vertices, translations and rotations of objects and
+    camera, colour, opacity and thickness; which pixels a triangle covers, the order of the fragments, the texels that a
+    lookup takes and the baked Lambert factors are held fixed: a gradient in vertices or poses moves depths and
+    attributes inside outlines, not the outlines.
 
     Args:
         scene: what to capture.
         camera: where from; default the scene's.
         sort: order of a pixel's fragments: by (depth, object, primitive), or as submitted, by (object, primitive).
         parameters: values in place of the scene's own, by the names of `scene.parameters()`: numbers, NumPy arrays, or
-            torch tensors, in which the fragments are then differentiable. `"beta"` is not used here.
+            torch tensors, in which the fragments are then differentiable. `"thickness"` is that of all objects without
+            a value of their own here. `"beta"` is not used here.
         rows: capture only these rows [begin, end) of the image; default all.
         memory_limit: most memory that fragments and their gradients may take [bytes]; default half of what is free.
 
@@ -166,14 +225,7 @@ def capture(
     window = Window.of(camera, _check_rows(rows, camera))
     surfaces = place_surfaces(assemble(scene, parameters, camera=camera), camera)
     with surfaces.stream():
-        triangles = surfaces.triangles(window)
-        allowed = allowed_memory(memory_limit, triangles.device)
-        starts, total = scan_counts(count_fragments(triangles))
-        gradient = surfaces.differentiable
-        needed = fixed_bytes(triangles, gradient) + total * fragment_bytes(triangles.points.dtype, gradient)
-        if needed > allowed:
-            refuse(needed, allowed, f"{total} fragments")
-        return fragments_of_rows(surfaces, triangles, starts, total, sort)
+        return fragments_of_rows(surfaces, *count_within(surfaces, window, memory_limit), sort)
 
 
 def check_scene(scene: Any, camera: Any) -> Camera:

@@ -32,9 +32,11 @@ def render(
 ) -> Any:
     """Render a scene: capture its fragments, merge them into layers, and composite those.
 
-    Differentiable in everything that `capture` and `resolve` are. An image that would take more memory than allowed is
-    rendered in bands of rows, with the same pixels to the bit; then its gradient is computed band by band, each of them
-    captured once more.
+    Differentiable in everything that `capture` and `resolve` are; a gradient in vertices, or in a translation or
+    rotation of an object or the camera, moves depths and attributes inside outlines, not the outlines.
+
+    An image that would take more memory than allowed is rendered in bands of rows, with the same pixels to the bit;
+    then its gradient is computed band by band, each of them captured once more.
 
     Args:
         scene: what to render.

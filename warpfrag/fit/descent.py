@@ -4,6 +4,9 @@ Bounds. Adam moves the coordinates and is put back on the bound after a step tha
 the learning rate, so nothing is lost. L-BFGS learns the curvature from the gradients and must not be pushed about: it
 moves w with coordinate = middle + half·sin(w/half), which cannot leave the bounds, has slope 1 in the middle and
 slope 0 at the bounds (as in MINUIT).
+
+Maps are fitted from coarse to fine in stages, each with an equal share of the steps that are left (`maps`). With
+several processes each computes the loss of its share of the views; what they exchange are gradients in the parameters.
 """
 
 import math
@@ -15,17 +18,12 @@ from typing import Any
 import numpy as np
 
 from warpfrag.extras import need
-from warpfrag.fit.jacobian import Evaluation
-from warpfrag.fit.losses import RobustLoss
+from warpfrag.fit.maps import Smoothness, coarsen, level_of, refine
 from warpfrag.fit.outcome import Outcome
 from warpfrag.fit.problem import Problem
 from warpfrag.fit.session import FitError, Session, check_finite
 from warpfrag.fit.study import StudyError
 
-# Adam stops when the best loss of so many steps is not better than the best before them by the tolerance.
-ADAM_PATIENCE = 50
-# L-BFGS stops after so many steps in a row that changed the loss relatively by less than the tolerance.
-LBFGS_PATIENCE = 3
 LBFGS_EVALUATIONS = 25
 # L-BFGS starts at least this share of the range inside the bounds, where the slope is not 0.
 INSIDE = 1e-3
@@ -35,78 +33,168 @@ class _Coordinate:
     """One parameter's coordinates as a torch leaf, in the way a method moves them."""
 
     def __init__(self, problem: Problem, index: int, bent: bool) -> None:
+        self.variable, self.device = problem.study.variables[index], problem.processes.device
+        self.lower, self.upper = self.variable.span
+        self.bent = bent and math.isfinite(self.lower)
+        self.middle, self.half = 0.5 * (self.lower + self.upper), 0.5 * (self.upper - self.lower)
+        self.smoothness: Smoothness | None = None
+        if self.variable.smoothness:
+            self.smoothness = Smoothness(self.variable, problem.study.fitted_scene, self.device)
+        self.leaf: Any = None
+
+    def put(self, coordinate: np.ndarray, stage: int) -> None:
+        """Make a new leaf for coordinates, on the grid of a stage."""
         import torch
 
-        self.variable = variable = problem.study.variables[index]
-        self.lower, self.upper = variable.span
-        self.bent = bent and math.isfinite(self.lower)
-        start = variable.inward(variable.start)
+        whole = torch.tensor(coordinate.reshape(self.variable.start.shape), dtype=torch.float64, device=self.device)
+        leaf = coarsen(whole, level_of(self.variable, stage))
         if self.bent:
-            self.middle, self.half = 0.5 * (self.lower + self.upper), 0.5 * (self.upper - self.lower)
-            share = np.clip((start - self.middle) / self.half, INSIDE - 1.0, 1.0 - INSIDE)
-            start = self.half * np.arcsin(share)
-        self.leaf = torch.tensor(start, dtype=torch.float64, device=problem.study.device, requires_grad=True)
+            leaf = self.half * torch.asin(((leaf - self.middle) / self.half).clamp(INSIDE - 1.0, 1.0 - INSIDE))
+        self.leaf = leaf.requires_grad_()
 
     def coordinate(self) -> Any:
-        """Return the coordinate, differentiable."""
-        return self.middle + self.half * (self.leaf / self.half).sin() if self.bent else self.leaf
+        """Return the coordinates, differentiable in the leaf."""
+        inside = self.middle + self.half * (self.leaf / self.half).sin() if self.bent else self.leaf
+        return refine(inside, self.variable.start.shape) if self.variable.levels > 1 else inside
 
     def project(self) -> None:
-        """Put it back between the bounds."""
+        """Put the leaf back between the bounds."""
         if not self.bent and math.isfinite(self.lower):
             self.leaf.data.clamp_(self.lower, self.upper)
 
 
-class _Descent:
-    """What both methods share: loss and gradient, the best so far, state to and from checkpoints."""
+class Descent:
+    """What both methods share: loss and gradient, stages, the best so far, state to and from checkpoints.
 
-    def __init__(self, problem: Problem, session: Session, bent: bool) -> None:
+    Args:
+        problem: what to fit.
+        session: the course of the fit; what is in its state is taken up.
+    """
+
+    bent = False
+
+    def __init__(self, problem: Problem, session: Session) -> None:
         study = problem.study
-        import torch
-
+        self.torch = torch = need("torch", "torch", "Adam and L-BFGS")
         try:
             torch.zeros(1, device=study.device)
         except (RuntimeError, AssertionError) as error:
             reason = str(error).splitlines()[0]
             raise StudyError(f"device: found {study.device!r}, which torch cannot use ({reason})") from None
-        torch.manual_seed(study.seed)
-        self.torch, self.problem, self.session = torch, problem, session
-        self.frozen = problem.frozen.torch(study.device) if problem.frozen is not None else None
-        self.loss = RobustLoss.named(study.loss, study.delta)
-        self.coordinates = [_Coordinate(problem, index, bent) for index in range(len(study.variables))]
-        self.evaluations = 0
-        self.best_loss = math.inf
-        self.best = problem.start()
+        self.problem, self.session, self.study = problem, session, study
+        self.coordinates = [_Coordinate(problem, index, self.bent) for index in range(len(study.variables))]
+        self.stages = max(variable.levels for variable in study.variables)
+        # Where each start has come to.
+        self.states: list[dict[str, Any]] = list(session.state.get("runs", []))
+        self.index = -1
 
-    def evaluate(self) -> Any:
-        """Compute loss and gradient.
+    def optimizer(self) -> Any:
+        """Return a new optimiser of the leaves."""
+        raise NotImplementedError
+
+    def step(self) -> float:
+        """Take one step and return the loss before it."""
+        raise NotImplementedError
+
+    def settled(self) -> str | None:
+        """Return why the stage has come to its end, if it has."""
+        raise NotImplementedError
+
+    def run(self, start: np.ndarray) -> Outcome:
+        """Fit from a start, or go on from where the checkpoint has come to from there."""
+        self.index += 1
+        with _one_torch_thread():
+            return self._run(start)
+
+    def _run(self, start: np.ndarray) -> Outcome:
+        steps = int(self.study.steps or 0)
+        self.begin = len(self.session.losses)
+        self.evaluations, self.best_loss, self.best = 0, math.inf, start
+        self._enter(0, start, steps // self.stages)
+        if self.index < len(self.states):
+            self._restore(self.states[self.index])
+        converged, reason = False, "the largest number of steps was reached"
+        while True:
+            why = self.settled()
+            last = self.stage + 1 == self.stages
+            if last and (why is not None or self.done >= steps):
+                converged, reason = why is not None, why or reason
+                break
+            if not last and (why is not None or self.done >= self.stage_end):
+                left = (steps - self.done) // (self.stages - self.stage - 1)
+                self._enter(self.stage + 1, self.vector(), self.done + left)
+                continue
+            values = self.values()
+            loss = self.step()
+            for coordinate in self.coordinates:
+                coordinate.project()
+            self._score(loss)
+            self.session.step(loss, values, self._state)
+        self.session.state = self._state()
+        self.states = self.session.state["runs"]
+        return Outcome(self.best, self.best_loss, converged, reason, self.evaluations)
+
+    @property
+    def done(self) -> int:
+        """Steps done from this start."""
+        return len(self.session.losses) - self.begin
+
+    def evaluate(self, views: list[int]) -> Any:
+        """Compute the loss of some views and its gradient in the leaves.
 
         Raises:
             FitError: one of them is not finite.
         """
-        step = len(self.session.losses) + 1
+        torch, step = self.torch, len(self.session.losses) + 1
         for coordinate in self.coordinates:
             coordinate.leaf.grad = None
-        tensors = {c.variable.name: c.variable.outward(c.coordinate()) for c in self.coordinates}
-        values = {name: tensor.detach().cpu().numpy() for name, tensor in tensors.items()}
-        try:
-            image = self.problem.image(tensors, self.frozen)
-        except ValueError as error:
-            check_finite(step, math.nan, values)
-            raise FitError(f"step {step}: {error}") from error
-        loss = self.loss.rho(self.problem.residual(image).double()).mean() * self.loss.factor
-        number = float(loss.detach())
-        check_finite(step, number, values)
-        loss.backward()
-        # An image that does not depend on a parameter (all of it behind an opaque one, say) has no gradient for it.
-        for coordinate in self.coordinates:
-            if coordinate.leaf.grad is None:
-                coordinate.leaf.grad = self.torch.zeros_like(coordinate.leaf)
-        check_finite(step, number, values, {c.variable.name: c.leaf.grad.cpu().numpy() for c in self.coordinates})
+        inward = [coordinate.coordinate() for coordinate in self.coordinates]
+        outward = [c.variable.outward(tensor) for c, tensor in zip(self.coordinates, inward, strict=True)]
+        # Leaves of their own, so that each view's graph is gone before the next is made.
+        leaves = {c.variable.name: t.detach().requires_grad_() for c, t in zip(self.coordinates, outward, strict=True)}
+        values = {name: leaf.detach().cpu().numpy() for name, leaf in leaves.items()}
+        total = 0.0
+        for index in self.problem.processes.share(views):
+            try:
+                view = self.problem.views[index]
+                loss = view.loss(view.image(leaves)) / len(views)
+            except ValueError as error:
+                check_finite(step, math.nan, values)
+                raise FitError(f"step {step}: {error}") from error
+            total += float(loss.detach())
+            # An image that depends on no parameter (all of it out of sight, say) has no gradient.
+            if loss.requires_grad:
+                loss.backward()
+        gradients = [torch.zeros_like(x) if x.grad is None else x.grad for x in leaves.values()]
+        total, gradients = self._over_processes(total, gradients)
+        check_finite(step, total, values, {n: g.cpu().numpy() for n, g in zip(leaves, gradients, strict=True)})
+        priors = [c.smoothness(t) for c, t in zip(self.coordinates, inward, strict=True) if c.smoothness]
+        torch.autograd.backward([*outward, *priors], [*gradients, *(torch.ones_like(prior) for prior in priors)])
         self.evaluations += 1
-        if number < self.best_loss:
-            self.best_loss, self.best = number, self.vector()
-        return loss.detach()
+        return total + sum(float(prior.detach()) for prior in priors)
+
+    def _over_processes(self, total: float, gradients: list[Any]) -> tuple[float, list[Any]]:
+        """Add up loss and gradients of all processes; a wish to stop in one of them is one in all."""
+        if self.problem.processes.count == 1:
+            return total, gradients
+        torch = self.torch
+        flat = torch.cat([gradient.reshape(-1) for gradient in gradients]).cpu().numpy()
+        summed = self.problem.processes.sum(np.concatenate([[total, float(self.session.interrupted)], flat]))
+        self.session.interrupted = bool(summed[1])
+        parts = torch.as_tensor(summed[2:], device=gradients[0].device).split([g.numel() for g in gradients])
+        return float(summed[0]), [part.reshape(g.shape) for part, g in zip(parts, gradients, strict=True)]
+
+    def full_loss(self) -> float:
+        """Return the loss of all views, prior included, without a gradient."""
+        torch = self.torch
+        with torch.no_grad():
+            inward = [coordinate.coordinate() for coordinate in self.coordinates]
+            outward = {c.variable.name: c.variable.outward(t) for c, t in zip(self.coordinates, inward, strict=True)}
+            mine = self.problem.processes.share(list(range(len(self.problem.views))))
+            views = [self.problem.views[index] for index in mine]
+            total = sum(float(view.loss(view.image(outward))) for view in views) / len(self.problem.views)
+            priors = [float(c.smoothness(t)) for c, t in zip(self.coordinates, inward, strict=True) if c.smoothness]
+        return float(self.problem.processes.sum(np.array([total]))[0]) + sum(priors)
 
     def vector(self) -> np.ndarray:
         """Return all coordinates as one vector."""
@@ -116,48 +204,136 @@ class _Descent:
         """Return the parameters where the leaves are."""
         return self.problem.values(self.vector())
 
-    def state(self, optimizer: Any) -> dict[str, Any]:
-        """Return all that is needed to go on."""
-        return {
-            "leaves": [coordinate.leaf.detach().clone() for coordinate in self.coordinates],
-            "optimizer": optimizer.state_dict(),
-            "losses": list(self.session.losses),
-            "evaluations": self.evaluations,
-            "best_loss": self.best_loss,
-            "best": self.torch.tensor(self.best),
-        }
+    def keep(self, loss: float) -> None:
+        """Keep the coordinates if none before had a smaller loss."""
+        if loss < self.best_loss:
+            self.best_loss, self.best = loss, self.vector()
 
-    def restore(self, optimizer: Any) -> None:
-        """Take up the session's state, if there is one."""
-        state = self.session.state
-        if not state:
-            return
+    def _score(self, loss: float) -> None:
+        """Take note of the loss that the stopping rule goes by."""
+        self.scores.append(loss)
+
+    def _enter(self, stage: int, vector: np.ndarray, end: int) -> None:
+        """Begin a stage from a vector of coordinates."""
+        self.stage, self.stage_end, self.scores = stage, end, []
+        first = 0
+        for coordinate in self.coordinates:
+            last = first + coordinate.variable.start.size
+            coordinate.put(vector[first:last], stage)
+            first = last
+        self.torch_optimizer = self.optimizer()
+
+    def _state(self) -> dict[str, Any]:
+        """Return all that is needed to go on."""
+        current = {
+            "leaves": [coordinate.leaf.detach().clone() for coordinate in self.coordinates],
+            "optimizer": self.torch_optimizer.state_dict(),
+            **{"losses": self.session.losses[self.begin :], "scores": list(self.scores)},
+            **{"stage": self.stage, "stage_end": self.stage_end, "evaluations": self.evaluations},
+            **{"best_loss": self.best_loss, "best": self.torch.tensor(self.best)},
+        }
+        return {"runs": [*self.states[: self.index], current, *self.states[self.index + 1 :]]}
+
+    def _restore(self, state: dict[str, Any]) -> None:
+        """Take up where a checkpoint was written."""
+        self._enter(state["stage"], self.vector(), state["stage_end"])
         for coordinate, leaf in zip(self.coordinates, state["leaves"], strict=True):
             coordinate.leaf.data.copy_(leaf)
-        optimizer.load_state_dict(state["optimizer"])
-        self.session.losses[:] = state["losses"]
-        self.evaluations, self.best_loss = state["evaluations"], state["best_loss"]
-        self.best = state["best"].cpu().numpy()
-
-    def outcome(self, optimizer: Any, converged: bool, reason: str) -> Outcome:
-        """Return the best that was found."""
-        self.session.state = self.state(optimizer)
-        compressed = None
-        if self.problem.study.is_global:
-            compressed = Evaluation(self.problem, self.loss, self.best).compress()
-        return Outcome(self.best, self.best_loss, converged, reason, self.evaluations, compressed)
+        self.torch_optimizer.load_state_dict(state["optimizer"])
+        self.session.losses += state["losses"]
+        self.scores, self.evaluations = state["scores"], state["evaluations"]
+        self.best_loss, self.best = state["best_loss"], state["best"].cpu().numpy()
 
 
-def adam(problem: Problem, session: Session) -> Outcome:
-    """Fit by Adam."""
-    with _one_torch_thread():
-        return _adam(problem, session)
+class Adam(Descent):
+    """Adam, on all views or on a batch of them in each step.
+
+    With batches the losses of single steps say little: after each round through all views the loss of all of them is
+    computed, by which the best is kept and the fit stopped.
+    """
+
+    def optimizer(self) -> Any:
+        """Return a new optimiser of the leaves."""
+        rate = self.study.learning_rate
+        groups = [{"params": [c.leaf], "lr": c.variable.learning_rate or rate} for c in self.coordinates]
+        return self.torch.optim.Adam(groups)
+
+    def step(self) -> float:
+        """Take one step and return the loss before it, of its batch."""
+        loss = self.evaluate(self._batch())
+        if self.study.batch is None:
+            self.keep(loss)
+        self.torch_optimizer.step()
+        return loss
+
+    def settled(self) -> str | None:
+        """Return why the stage has come to its end, if it has."""
+        patience = -(-int(self.study.patience or 1) // self._round)
+        if len(self.scores) <= patience:
+            return None
+        best, before = min(self.scores[-patience:]), min(self.scores[:-patience])
+        stalled = best > (1.0 - self.study.tolerance) * before
+        return f"{self.study.patience} steps brought nothing better" if stalled else None
+
+    @property
+    def _round(self) -> int:
+        """Steps in which all views have their turn."""
+        return -(-len(self.problem.views) // (self.study.batch or len(self.problem.views)))
+
+    def _batch(self) -> list[int]:
+        count = len(self.problem.views)
+        if self.study.batch is None:
+            return list(range(count))
+        turn, place = divmod(self.done, self._round)
+        order = np.random.default_rng([self.study.seed, turn]).permutation(count)
+        return sorted(order[place * self.study.batch : (place + 1) * self.study.batch].tolist())
+
+    def _score(self, loss: float) -> None:
+        if self.study.batch is None:
+            self.scores.append(loss)
+        # The step at hand is not yet in the history.
+        elif (self.done + 1) % self._round == 0 or self.done + 1 == self.study.steps:
+            full = self.full_loss()
+            self.scores.append(full)
+            self.keep(full)
 
 
-def lbfgs(problem: Problem, session: Session) -> Outcome:
-    """Fit by L-BFGS with a strong Wolfe line search."""
-    with _one_torch_thread():
-        return _lbfgs(problem, session)
+class LBFGS(Descent):
+    """L-BFGS with a strong Wolfe line search."""
+
+    bent = True
+
+    def optimizer(self) -> Any:
+        """Return a new optimiser of the leaves."""
+        return self.torch.optim.LBFGS(
+            [c.leaf for c in self.coordinates],
+            lr=1.0,
+            max_iter=1,
+            max_eval=LBFGS_EVALUATIONS,
+            # The rule below stops it.
+            tolerance_grad=0.0,
+            tolerance_change=0.0,
+            history_size=10,
+            line_search_fn="strong_wolfe",
+        )
+
+    def step(self) -> float:
+        """Take one step and return the loss before it."""
+        return float(self.torch_optimizer.step(self._closure))
+
+    def settled(self) -> str | None:
+        """Return why the stage has come to its end, if it has."""
+        patience = int(self.study.patience or 1)
+        if len(self.scores) <= patience:
+            return None
+        recent = self.scores[-patience - 1 :]
+        same = all(abs(a - b) <= self.study.tolerance * abs(a) for a, b in pairwise(recent))
+        return "the loss stopped changing" if same else None
+
+    def _closure(self) -> float:
+        loss = self.evaluate(list(range(len(self.problem.views))))
+        self.keep(loss)
+        return loss
 
 
 @contextmanager
@@ -174,59 +350,3 @@ def _one_torch_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-def _adam(problem: Problem, session: Session) -> Outcome:
-    study = problem.study
-    descent = _Descent(problem, session, bent=False)
-    groups = [{"params": [c.leaf], "lr": c.variable.learning_rate or study.learning_rate} for c in descent.coordinates]
-    optimizer = descent.torch.optim.Adam(groups)
-    descent.restore(optimizer)
-    losses = session.losses
-    while len(losses) < int(study.steps or 0):
-        if _stalled(losses, study.tolerance):
-            return descent.outcome(optimizer, True, f"{ADAM_PATIENCE} steps brought nothing better")
-        loss = float(descent.evaluate())
-        values = descent.values()
-        optimizer.step()
-        for coordinate in descent.coordinates:
-            coordinate.project()
-        session.step(loss, values, lambda: descent.state(optimizer))
-    return descent.outcome(optimizer, False, "the largest number of steps was reached")
-
-
-def _lbfgs(problem: Problem, session: Session) -> Outcome:
-    study = problem.study
-    descent = _Descent(problem, session, bent=True)
-    optimizer = descent.torch.optim.LBFGS(
-        [c.leaf for c in descent.coordinates],
-        lr=1.0,
-        max_iter=1,
-        max_eval=LBFGS_EVALUATIONS,
-        # The rule below stops it.
-        tolerance_grad=0.0,
-        tolerance_change=0.0,
-        history_size=10,
-        line_search_fn="strong_wolfe",
-    )
-    descent.restore(optimizer)
-    losses = session.losses
-    while len(losses) < int(study.steps or 0):
-        if _settled(losses, study.tolerance):
-            return descent.outcome(optimizer, True, "the loss stopped changing")
-        loss = float(optimizer.step(descent.evaluate))
-        session.step(loss, descent.values(), lambda: descent.state(optimizer))
-    return descent.outcome(optimizer, False, "the largest number of steps was reached")
-
-
-def _stalled(losses: list[float], tolerance: float) -> bool:
-    if len(losses) <= ADAM_PATIENCE:
-        return False
-    return min(losses[-ADAM_PATIENCE:]) > (1.0 - tolerance) * min(losses[:-ADAM_PATIENCE])
-
-
-def _settled(losses: list[float], tolerance: float) -> bool:
-    if len(losses) <= LBFGS_PATIENCE:
-        return False
-    recent = losses[-LBFGS_PATIENCE - 1 :]
-    return all(abs(a - b) <= tolerance * abs(a) for a, b in pairwise(recent))

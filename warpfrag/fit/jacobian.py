@@ -1,29 +1,43 @@
-"""The exact Jacobian of the whole image in four adjoint passes, however many parameters there are.
+"""The exact Jacobian of the images in four adjoint passes, however many parameters there are.
 
 Pixels do not depend on one another: one adjoint pass seeded with ones in a channel yields, for every fragment, the
-derivative of its own pixel in that channel. Summed by pixel and object they are the columns of the Jacobian.
+derivative of its own pixel in that channel. Summed by pixel and object they are the columns of the Jacobian. Where
+surfaces or the camera move, a fragment's derivatives first become the force and torque on its surface (see
+`Coverage.motion_gradients`), and these the columns of a transform.
 
 Least squares needs of residuals f and Jacobian J only |f|², JᵀJ and Jᵀf. A QR decomposition of [f J] keeps these in as
-many rows as there are columns, without squaring the condition number: an evaluation of any image fits in a few hundred
-bytes.
+many rows as there are columns, without squaring the condition number: an evaluation of any number of images fits in a
+few hundred bytes, and processes exchange no more.
 """
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
+from typing import Any
 
 import numpy as np
 import warp as wp
 
-from warpfrag.fit.losses import RobustLoss
-from warpfrag.fit.parameters import Variable
-from warpfrag.fit.problem import Problem
+from warpfrag.capture.coverage import Coverage
+from warpfrag.fit.frozen import UnitFragments
+from warpfrag.fit.losses import RobustLoss, pyramid
+from warpfrag.fit.parameters import CAMERA
+from warpfrag.fit.problem import Problem, ViewProblem
 from warpfrag.fragments import Fragments
+from warpfrag.interop.launch import Span, launch
+from warpfrag.scene.pose import pose_matrix
+
+wp.set_module_options({"enable_backward": False})
+
+# Columns of the table of objects: where a derivative goes, −1 for nowhere.
+_THICKNESS, _OPACITY, _COLOR = 0, 1, 2
 
 
 @dataclass(frozen=True, eq=False)
 class Compressed:
     """Residuals and Jacobian in few rows, scaled by 1/sqrt(number of residuals).
 
-    The residuals are (sqrt(mean rho), 0, 0, …); `jacobian` is such that JᵀJ and Jᵀf are those of the whole image,
+    The residuals are (sqrt(mean rho), 0, 0, …); `jacobian` is such that JᵀJ and Jᵀf are those of the whole images,
     weighted as the loss says.
 
     Attributes:
@@ -35,97 +49,220 @@ class Compressed:
     jacobian: np.ndarray
 
 
-class Evaluation:
-    """The image for one vector of coordinates, and its Jacobian when asked for."""
+@cache
+def _sum_kernel() -> wp.Kernel:
+    @wp.kernel(module="unique", enable_backward=False)
+    def sum_columns(
+        span: Span,
+        offsets: wp.array(dtype=int),
+        object_id: wp.array(dtype=int),
+        columns: wp.array(dtype=wp.vec3i),
+        rgba_scale: wp.array(dtype=wp.vec4f),
+        unit_rgba: wp.array(dtype=wp.vec4f),
+        thickness: wp.array(dtype=float),
+        grad_rgba: wp.array(dtype=wp.vec4f),
+        grad_thickness: wp.array(dtype=float),
+        sums: wp.array2d(dtype=wp.float64),
+    ):
+        for pixel in range(span.begin + wp.tid(), span.end, span.stride):
+            for fragment in range(offsets[pixel], offsets[pixel + 1]):
+                item = object_id[fragment]
+                column = columns[item]
+                if column[0] >= 0:
+                    # Coordinates are logarithms: dt/dlog t = t.
+                    to_log = grad_thickness[fragment] * thickness[fragment]
+                    sums[pixel, column[0]] = sums[pixel, column[0]] + wp.float64(to_log)
+                if column[1] >= 0 or column[2] >= 0:
+                    g = wp.cw_mul(grad_rgba[fragment], unit_rgba[fragment])
+                    scale = rgba_scale[item]
+                    if column[1] >= 0:
+                        # scale = (colour·opacity, opacity), where the opacity is kept apart as the last.
+                        to_opacity = g[0] * scale[0] + g[1] * scale[1] + g[2] * scale[2] + g[3]
+                        sums[pixel, column[1]] = sums[pixel, column[1]] + wp.float64(to_opacity)
+                    if column[2] >= 0:
+                        for k in range(3):
+                            to_color = wp.float64(g[k] * scale[3])
+                            sums[pixel, column[2] + k] = sums[pixel, column[2] + k] + to_color
 
-    def __init__(self, problem: Problem, loss: RobustLoss, coordinates: np.ndarray) -> None:
-        assert problem.frozen is not None
-        self.problem, self.loss, self.unit = problem, loss, problem.frozen
-        self.values = problem.values(coordinates)
+    return sum_columns
+
+
+class ViewEvaluation:
+    """The image of a view for parameter values, and its Jacobian when asked for."""
+
+    def __init__(self, problem: ViewProblem, loss: RobustLoss, values: Mapping[str, Any]) -> None:
+        self.problem, self.loss = problem, loss
         self.variables = problem.study.variables
+        self.values = problem.parameters(values)
+        self.coverage, self.unit = self._unit()
         keys = {variable.key for variable in self.variables}
         # A scene that is out of sight has no fragments to differentiate by.
         keys = keys if self.unit.fragments.count else set()
-        single = {name: value.astype(np.float32) for name, value in self.values.items()}
-        fragments = self.unit.scaled(single)
+        self.fragments = self.unit.scaled(self.values, self.variables)
         device = problem.study.device
         # Beta as one value per pixel, so that its gradient stays apart by pixel.
-        beta = np.full(problem.scene.camera.shape, single.get("beta", problem.scene.beta), np.float32)
-        self.rgba = wp.array(fragments.rgba, device=device, requires_grad=bool(keys & {"opacity", "color"}))
-        self.thickness = wp.array(fragments.thickness, device=device, requires_grad="thickness" in keys)
-        self.beta = wp.array(beta, device=device, requires_grad="beta" in keys)
-        shared = Fragments(
-            self.rgba,
-            wp.array(fragments.depth, device=device),
-            self.thickness,
-            wp.array(fragments.offsets, device=device),
-            fragments.shape,
+        beta = np.full(problem.scene.camera.shape, self.values.get("beta", problem.scene.beta), np.float32)
+        moves = problem.moves and bool(keys)
+        self.rgba = wp.array(
+            self.fragments.rgba, device=device, requires_grad=moves or bool(keys & {"opacity", "color"})
         )
+        self.depth = wp.array(self.fragments.depth, device=device, requires_grad=moves)
+        self.thickness = wp.array(self.fragments.thickness, device=device, requires_grad=moves or "thickness" in keys)
+        self.beta = wp.array(beta, device=device, requires_grad="beta" in keys)
+        offsets = wp.array(self.fragments.offsets, device=device)
         self.tape = wp.Tape()
         with self.tape:
+            shared = Fragments(self.rgba, self.depth, self.thickness, offsets, self.fragments.shape)
             self.raw = problem.composite(shared, self.beta)
-        image = problem.over_background(self.raw.numpy())
-        self.residual = problem.residual(image).astype(np.float64).reshape(-1, problem.channels)
-        self.cost = float(loss.rho(self.residual).mean())
+        self.residual = problem.residual(problem.over_background(self.raw.numpy())).astype(np.float64)
+        levels = [loss.rho(level).mean() for level in pyramid(self.residual, problem.study.scales)]
+        self.cost = float(np.mean(levels))
 
-    def compress(self) -> Compressed:
-        """Return the compressed residuals and Jacobian."""
-        # Pixels that no fragment covers do not depend on anything.
-        counts = np.diff(self.unit.fragments.offsets)
-        covered = np.flatnonzero(counts)
-        pixels = np.repeat(np.arange(counts.size), counts)
-        columns = sum(variable.start.size for variable in self.variables)
-        triangle = np.zeros((columns + 1, columns + 1))
+    @property
+    def covered(self) -> np.ndarray:
+        """Whether any object covers a pixel, (H, W)."""
+        return (np.diff(self.fragments.offsets) > 0).reshape(self.fragments.shape)
+
+    def blocks(self) -> Iterator[tuple[float, np.ndarray]]:
+        """Yield rows [f J] and the weight of their squares in the view's mean."""
+        covered = self.covered
         for channel in range(self.problem.channels):
-            jacobian = self.channel(channel, pixels)[covered]
-            residual = self.residual[covered, channel]
-            weight = np.sqrt(self.loss.weight(residual))
-            rows = np.concatenate([residual[:, None], jacobian], axis=1) * weight[:, None]
-            triangle = np.asarray(np.linalg.qr(np.concatenate([triangle, rows]), mode="r"))
-        return _compress(triangle / np.sqrt(self.residual.size), self.cost)
+            jacobian = self.channel(channel).reshape(*covered.shape, -1)
+            rows = np.concatenate([self.residual[..., channel, None], jacobian], axis=-1)
+            levels = [np.concatenate([rows, covered[..., None]], axis=-1)]
+            if self.problem.study.scales > 1:
+                levels = list(pyramid(levels[0], self.problem.study.scales))
+            for level in levels:
+                # Pixels that no fragment covers do not depend on anything.
+                inside = level[level[..., -1] > 0.0][:, :-1]
+                weight = np.sqrt(self.loss.weight(inside[:, 0]))
+                count = level.shape[0] * level.shape[1] * self.problem.channels
+                yield 1.0 / (count * len(levels)), inside * weight[:, None]
 
-    def channel(self, channel: int, pixels: np.ndarray) -> np.ndarray:
-        """Return the derivatives of one channel of the image in all coordinates, (P, coordinates).
+    def _unit(self) -> tuple[Coverage, UnitFragments]:
+        problem = self.problem
+        if not problem.moves:
+            return problem.coverage, problem.unit
+        moved = {v.name: self.values[v.name] for v in self.variables if v.moves}
+        coverage = Coverage.of(problem.scene, parameters=moved, sort=problem.study.resolve == "sorted")
+        return coverage, UnitFragments(problem.scene, coverage, self.variables, moved)
 
-        Args:
-            channel: 0 to 3.
-            pixels: the pixel of each fragment.
-        """
-        background = self.problem.background
-        # Opacity does not depend on beta, thickness or colour: no pass where it cannot change.
-        fixed = channel == 3 and (background[3] == 1.0 or all(v.key != "opacity" for v in self.variables))
-        if fixed or not self.unit.fragments.count:
-            return np.zeros((len(self.residual), sum(variable.start.size for variable in self.variables)))
+    def channel(self, channel: int) -> np.ndarray:
+        """Return the derivatives of one channel of the image in all coordinates, (pixels, coordinates)."""
+        background, count = self.problem.background, int(self.fragments.offsets.size) - 1
+        sums = np.zeros((count, sum(variable.start.size for variable in self.variables)))
+        # Opacity does not depend on beta, thickness, colour or depth: no pass where it cannot change. Texture and
+        # opacity per vertex move with their surface.
+        fixed = channel == 3 and (
+            background[3] == 1.0 or not (self.problem.moves or any(v.key == "opacity" for v in self.variables))
+        )
+        if fixed or not self.fragments.count:
+            return sums
         seed = np.zeros(self.raw.shape, np.float32)
         seed[..., channel] = 1.0
         seed[..., 3] -= background[channel]
         self.tape.zero()
         self.tape.backward(grads={self.raw: wp.array(seed, device=self.raw.device)})
-        columns = [
-            self.beta.grad.numpy().astype(np.float64).reshape(-1, 1)
-            if variable.key == "beta"
-            else self._object(variable, pixels)
-            for variable in self.variables
-        ]
-        return np.concatenate(columns, axis=1)
+        self._sum_objects(sums)
+        first = 0
+        for variable in self.variables:
+            if variable.key == "beta":
+                sums[:, first] = self.beta.grad.numpy().reshape(-1)
+            first += variable.start.size
+        if self.problem.moves:
+            self._sum_motions(sums)
+        return sums
 
-    def _object(self, variable: Variable, pixels: np.ndarray) -> np.ndarray:
-        """Sum what the fragments of an object contribute, by pixel: (P, 1), or (P, 3) for a colour."""
-        owner, value = variable.owner, self.values[variable.name]
-        members = np.flatnonzero(self.unit.masks[owner])
-        if variable.key == "thickness":
-            # Coordinates are logarithms: dt/dlog = t.
-            unit = self.unit.fragments.thickness[members]
-            each = (self.thickness.grad.numpy()[members] * unit * value)[:, None]
-        else:
-            unit, grad = self.unit.fragments.rgba[members], self.rgba.grad.numpy()[members]
-            if variable.key == "opacity":
-                color = self.values.get(f"{owner}.color", np.ones(3))
-                each = np.sum(grad * unit * np.append(color, 1.0), axis=1, keepdims=True)
-            else:
-                each = grad[:, :3] * unit[:, :3] * float(self.values.get(f"{owner}.opacity", 1.0))
-        sums = [np.bincount(pixels[members], column, len(self.residual)) for column in each.astype(np.float64).T]
-        return np.stack(sums, axis=1)
+    def _sum_objects(self, sums: np.ndarray) -> None:
+        """Add what thicknesses, opacities and colours contribute, by pixel."""
+        unit, device = self.unit, self.raw.device
+        columns = np.full((len(unit.names), 3), -1, np.int32)
+        first = 0
+        for variable in self.variables:
+            kind = {"thickness": _THICKNESS, "opacity": _OPACITY, "color": _COLOR}.get(variable.key)
+            if kind is not None:
+                columns[unit.owned(variable.name, self.variables), kind] = first
+            first += variable.start.size
+        if (columns < 0).all():
+            return
+        # Of the colours without the opacity, and that one.
+        scale = np.ones((len(unit.names), 4), np.float32)
+        for variable in self.variables:
+            owned = unit.owned(variable.name, self.variables)
+            if variable.key == "color":
+                scale[owned, :3] = self.values[variable.name]
+            elif variable.key == "opacity":
+                scale[owned, 3] = self.values[variable.name]
+        none = wp.empty((0,), dtype=wp.vec4f, device=device)
+        nothing = wp.empty((0,), dtype=float, device=device)
+        target = wp.array(sums, device=device, copy=False)
+        inputs = [
+            wp.array(self.fragments.offsets, dtype=int, device=device, copy=False),
+            wp.array(unit.objects, dtype=int, device=device, copy=False),
+            wp.array(columns, dtype=wp.vec3i, device=device),
+            wp.array(scale, dtype=wp.vec4f, device=device),
+            wp.array(unit.fragments.rgba, dtype=wp.vec4f, device=device, copy=False),
+            self.thickness,
+            none if self.rgba.grad is None else self.rgba.grad.view(wp.vec4f),
+            nothing if self.thickness.grad is None else self.thickness.grad,
+            target,
+        ]
+        launch(_sum_kernel(), len(sums), inputs, device)
+        if not device.is_cpu:
+            sums[...] = target.numpy()
+
+    def _sum_motions(self, sums: np.ndarray) -> None:
+        """Add what transforms of objects and of the camera contribute, by pixel."""
+        unit, scene = self.unit, self.problem.scene
+        rgba_scale, thickness_scale = unit.scales(self.values, self.variables)
+        motions = self.coverage.motion_gradients(
+            unit.parameters,
+            self.rgba.grad.numpy() * rgba_scale[unit.objects],
+            self.depth.grad.numpy(),
+            self.thickness.grad.numpy() * thickness_scale[unit.objects],
+        )
+        offsets = np.asarray(self.fragments.offsets)
+        pixels = np.repeat(np.arange(offsets.size - 1), np.diff(offsets))
+        first = 0
+        for variable in self.variables:
+            if variable.moves:
+                begin = first + (3 * self.problem.index if variable.per == "view" else 0)
+                whole = variable.owner == CAMERA
+                members = slice(None) if whole else np.flatnonzero(unit.objects == unit.names.index(variable.owner))
+                matrix = pose_matrix(variable.name, scene, parameters=unit.parameters) * variable.unit
+                for index, column in enumerate((motions[members] @ matrix).T):
+                    sums[:, begin + index] = np.bincount(pixels[members], column, len(sums))
+            first += variable.start.size
+
+
+class Evaluation:
+    """The images of all views for one vector of coordinates, and their Jacobian when asked for."""
+
+    def __init__(self, problem: Problem, loss: RobustLoss, coordinates: np.ndarray) -> None:
+        self.problem, self.size = problem, coordinates.size
+        values = problem.values(coordinates)
+        mine = problem.processes.share(list(range(len(problem.views))))
+        self.views = [ViewEvaluation(problem.views[index], loss, values) for index in mine]
+        total = problem.processes.sum(np.array([sum(view.cost for view in self.views)]))
+        self.cost = float(total[0]) / len(problem.views)
+
+    @property
+    def covered_count(self) -> int:
+        """Number of residuals in pixels that any object covers."""
+        mine = sum(np.count_nonzero(view.covered) * view.problem.channels for view in self.views)
+        return int(self.problem.processes.sum(np.array([float(mine)]))[0])
+
+    def compress(self) -> Compressed:
+        """Return the compressed residuals and Jacobian."""
+        triangle = np.zeros((self.size + 1, self.size + 1))
+        for view in self.views:
+            for weight, rows in view.blocks():
+                scaled = rows * np.sqrt(weight / len(self.problem.views))
+                triangle = np.asarray(np.linalg.qr(np.concatenate([triangle, scaled]), mode="r"))
+        parts = self.problem.processes.gather(triangle)
+        if len(parts) > 1:
+            triangle = np.asarray(np.linalg.qr(np.concatenate(parts), mode="r"))
+        return _compress(triangle, self.cost)
 
 
 def _compress(triangle: np.ndarray, cost: float) -> Compressed:

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from warpfrag.extras import need
-from warpfrag.fit.jacobian import Compressed, Evaluation
-from warpfrag.fit.losses import RobustLoss
+from warpfrag.fit.jacobian import Evaluation
 from warpfrag.fit.outcome import Outcome
 from warpfrag.fit.problem import Problem
 from warpfrag.fit.session import FitError, Session, check_finite
@@ -20,8 +19,6 @@ from warpfrag.fit.session import FitError, Session, check_finite
 SMALLEST_STEP = 2.0**-23
 # SciPy takes no tolerance below this.
 EPSILON = 1e-15
-# Random starts keep this share of the range away from the bounds.
-_MARGIN = 0.1
 _REASONS = {
     0: "the largest number of steps was reached",
     1: "the gradient vanished",
@@ -31,10 +28,18 @@ _REASONS = {
 }
 
 
-class _Memory:
-    """All evaluations by coordinates: cost, and the compressed Jacobian where it was asked for."""
+class LeastSquares:
+    """Fits by least squares: evaluates images and Jacobians for SciPy, and keeps them by coordinates.
 
-    def __init__(self, problem: Problem, session: Session, loss: RobustLoss) -> None:
+    Args:
+        problem: what to fit; every parameter global.
+        session: the course of the fit; what is in its state is gone through again without computing.
+    """
+
+    def __init__(self, problem: Problem, session: Session) -> None:
+        self.optimize = need("scipy.optimize", "fit", "Least squares")
+        loss = problem.study.image_loss.robust
+        assert loss is not None
         self.problem, self.session, self.loss = problem, session, loss
         self.costs: dict[bytes, float] = {}
         self.jacobians: dict[bytes, np.ndarray] = {}
@@ -46,9 +51,29 @@ class _Memory:
             self.jacobians = {
                 keys[i]: j for i, j in zip(state["jacobian_of"].tolist(), state["jacobians"], strict=True)
             }
-        self.recorded = set(self.costs)
 
-    def state(self) -> dict[str, Any]:
+    def run(self, start: np.ndarray) -> Outcome:
+        """Fit from a start."""
+        study = self.problem.study
+        lower, upper = self.problem.bounds()
+        # SciPy moves a start on a bound into the inside by itself.
+        found = self.optimize.least_squares(
+            self._residuals,
+            start,
+            self._jacobian,
+            bounds=(lower, upper),
+            method="trf",
+            x_scale="jac",
+            ftol=study.tolerance if study.tolerance > EPSILON else None,
+            xtol=max(study.tolerance, SMALLEST_STEP),
+            gtol=EPSILON,
+            max_nfev=study.steps,
+        )
+        self.session.state = self._state()
+        loss = self.costs[found.x.tobytes()] * self.loss.factor
+        return Outcome(found.x, loss, found.status > 0, _REASONS[found.status], found.nfev)
+
+    def _state(self) -> dict[str, Any]:
         """Return everything as arrays."""
         keys = list(self.costs)
         count = len(np.frombuffer(keys[0])) if keys else 0
@@ -61,37 +86,37 @@ class _Memory:
             "jacobians": jacobians,
         }
 
-    def evaluate(self, coordinates: np.ndarray) -> Evaluation:
-        """Return the image at some coordinates, once if asked twice in a row."""
+    def _evaluate(self, coordinates: np.ndarray) -> Evaluation:
+        """Return the images at some coordinates, once if asked twice in a row."""
         key = coordinates.tobytes()
         if self.kept is None or self.kept[0] != key:
-            # Freed before the next is made: each holds as many fragments as the scene has.
+            # Freed before the next is made: each holds as many fragments as the views have.
             self.kept = None
             self.kept = key, Evaluation(self.problem, self.loss, coordinates)
         return self.kept[1]
 
-    def residuals(self, coordinates: np.ndarray) -> np.ndarray:
+    def _residuals(self, coordinates: np.ndarray) -> np.ndarray:
         """Return the compressed residuals."""
         key = coordinates.tobytes()
         values = self.problem.values(coordinates)
         step = len(self.session.losses) + 1
         if key not in self.costs:
-            cost = self._checked(step, values, lambda: self.evaluate(coordinates).cost)
+            cost = self._checked(step, values, lambda: self._evaluate(coordinates).cost)
             check_finite(step, cost, values)
             self.costs[key] = cost
-            self.session.step(cost * self.loss.factor, values, self.state)
+            self.session.step(cost * self.loss.factor, values, self._state)
         else:
             self.session.losses.append(self.costs[key] * self.loss.factor)
         residuals = np.zeros(coordinates.size + 2)
         residuals[0] = np.sqrt(self.costs[key])
         return residuals
 
-    def jacobian(self, coordinates: np.ndarray) -> np.ndarray:
+    def _jacobian(self, coordinates: np.ndarray) -> np.ndarray:
         """Return the compressed Jacobian."""
         key = coordinates.tobytes()
         if key not in self.jacobians:
             step, values = len(self.session.losses), self.problem.values(coordinates)
-            found = self._checked(step, values, lambda: self.evaluate(coordinates).compress())
+            found = self._checked(step, values, lambda: self._evaluate(coordinates).compress())
             names = [v.name for v in self.problem.study.variables for _ in range(v.start.size)]
             columns = dict(zip(names, np.abs(found.jacobian).max(axis=0), strict=True))
             check_finite(step, found.cost * self.loss.factor, values, columns)
@@ -104,50 +129,3 @@ class _Memory:
         except ValueError as error:
             check_finite(step, float("nan"), values)
             raise FitError(f"step {step}: {error}") from error
-
-
-def least_squares(problem: Problem, session: Session) -> Outcome:
-    """Fit by least squares.
-
-    Args:
-        problem: what to fit; every parameter global.
-        session: the course of the fit; what is in its state is gone through again without computing.
-    """
-    optimize = need("scipy.optimize", "fit", "Least squares")
-    study = problem.study
-    loss = RobustLoss.named(study.loss, study.delta)
-    memory = _Memory(problem, session, loss)
-    lower, upper = problem.bounds()
-    best: Any = None
-    for start in _starts(problem, lower, upper):
-        # SciPy moves a start on a bound into the inside by itself.
-        found = optimize.least_squares(
-            memory.residuals,
-            start,
-            memory.jacobian,
-            bounds=(lower, upper),
-            method="trf",
-            x_scale="jac",
-            ftol=study.tolerance if study.tolerance > EPSILON else None,
-            xtol=max(study.tolerance, SMALLEST_STEP),
-            gtol=EPSILON,
-            max_nfev=study.steps,
-        )
-        if best is None or found.cost < best.cost:
-            best = found
-    jacobian = memory.jacobian(best.x)
-    session.state = memory.state()
-    converged = best.status > 0
-    compressed = Compressed(memory.costs[best.x.tobytes()], jacobian)
-    return Outcome(
-        best.x, compressed.cost * loss.factor, converged, _REASONS[best.status], len(memory.costs), compressed
-    )
-
-
-def _starts(problem: Problem, lower: np.ndarray, upper: np.ndarray) -> list[np.ndarray]:
-    generator = np.random.default_rng(problem.study.seed)
-    starts = [np.clip(problem.start(), lower, upper)]
-    for _ in range(problem.study.restarts):
-        share = generator.uniform(_MARGIN, 1.0 - _MARGIN, lower.shape)
-        starts.append(lower + share * (upper - lower))
-    return starts

@@ -21,15 +21,14 @@ UNDETERMINED = 0.25
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """Where a method ended.
+    """Where a method ended from one start.
 
     Attributes:
         coordinates: the best coordinates found.
         loss: the loss there.
         converged: whether the stopping rule ended the fit, not the number of steps.
         reason: why it ended.
-        evaluations: images computed.
-        compressed: residuals and Jacobian at the end, None where some parameter is not global.
+        evaluations: times that the images were computed.
     """
 
     coordinates: np.ndarray
@@ -37,7 +36,6 @@ class Outcome:
     converged: bool
     reason: str
     evaluations: int
-    compressed: Compressed | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,28 +1,36 @@
 """What is fitted: its start and bounds, and the coordinates in which a method moves it.
 
-Beta, opacities, colours and vertices are moved as they are, a thickness as its logarithm: a step then means a factor,
-whatever the scene's unit, and a thickness cannot become negative. Bounds hold in both coordinates.
+Beta, opacities, colours, vertices and transforms are moved as they are, a thickness as its logarithm: a step then means
+a factor, whatever the scene's unit, and a thickness cannot become negative. Bounds hold in both coordinates.
 """
 
 import math
+import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal
+from dataclasses import dataclass, replace
+from typing import Any, Literal, get_args
 
 import numpy as np
 
+from warpfrag.scene.camera import Camera
 from warpfrag.scene.errors import shorten, suggest
-from warpfrag.scene.objects import PARAMETER_KEYS, Scene, SceneObject
+from warpfrag.scene.objects import Scene, SceneObject
 
-Per = Literal["object", "vertex", "pixel"]
-PER = ("object", "vertex", "pixel")
+Per = Literal["object", "vertex", "pixel", "view"]
+PER = get_args(Per)
 
 # Defaults of the bounds of a thickness, as shares of the diagonal of the scene's bounding box.
 SMALLEST_THICKNESS = 1e-6
 LARGEST_THICKNESS = 1.0
-# One unit of a vertex coordinate in a method's coordinates, as a share of the diagonal: vertices move less than colours
-# do.
+# One unit of a vertex or translation in a method's coordinates, as a share of the diagonal: they move less than colours
+# do. One of a rotation is a radian.
 VERTEX_UNIT = 0.1
+# What moves surfaces or the camera: depths, and not only colours and thicknesses, depend on it.
+MOTIONS = ("vertices", "translation", "rotation")
+CAMERA = "camera"
+
+# A thickness in multiples of P(z).
+MULTIPLE_OF_P = re.compile(r"\s*([0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)\s*P\s*")
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,13 +38,18 @@ class FitParameter:
     """A parameter to fit.
 
     Attributes:
-        start: number or array to start from; None takes the scene's value.
+        start: number or array to start from; for a thickness also "2P", which has it fitted in multiples of P(z). None
+            takes the scene's value.
         lower: lower bound; None takes 0 for beta, opacity and colour, a millionth of the scene's extent for a
-            thickness, and none for vertices.
+            thickness, and none for vertices and transforms.
         upper: upper bound; None takes 1 for beta, opacity and colour, the scene's extent for a thickness, and none for
-            vertices.
-        per: "object" for one value (three for a colour), "vertex", or "pixel" for a map; None as the start is shaped.
+            vertices and transforms.
+        per: "object" for one value (three for a colour or a transform), "vertex", "pixel" for a map (of each view),
+            "view" for a camera's transform apart in each view; None as the start is shaped.
         learning_rate: Adam's step for this parameter; None takes the study's.
+        smoothness: weight of a prior on what is fitted per pixel or vertex: the mean squared difference of neighbours,
+            in the coordinates that methods move (for a thickness the logarithm), is added to the loss so many times.
+        levels: stages in which a map is fitted from coarse to fine: the first has pixels of 2^(levels − 1).
     """
 
     start: Any = None
@@ -44,44 +57,57 @@ class FitParameter:
     upper: float | None = None
     per: Per | None = None
     learning_rate: float | None = None
+    smoothness: float = 0.0
+    levels: int = 1
 
 
 @dataclass(frozen=True, eq=False)
 class Variable:
-    """A parameter with everything resolved against a scene.
+    """A parameter with everything resolved against a scene and its views.
 
     Attributes:
         name: the parameter's name.
-        start: where it starts, float64, of the shape the scene takes.
+        start: where it starts, float64, of the shape the scene takes; maps and transforms of several views stacked.
         lower: lower bound, or -inf.
         upper: upper bound, or inf.
+        per: what it has a value for.
         logarithm: whether methods move its logarithm.
-        unit: size of one unit of a method's coordinate; 1 but for vertices.
+        unit: size of one unit of a method's coordinate.
         learning_rate: Adam's step, None for the study's.
+        smoothness: weight of the prior.
+        levels: stages from coarse to fine.
     """
 
     name: str
     start: np.ndarray
     lower: float
     upper: float
+    per: Per
     logarithm: bool
     unit: float
     learning_rate: float | None
+    smoothness: float
+    levels: int
 
     @property
     def key(self) -> str:
-        """What it is: "beta" or one of `PARAMETER_KEYS`."""
+        """What it is: "beta", "thickness", "color" and so on."""
         return self.name.rpartition(".")[2]
 
     @property
     def owner(self) -> str:
-        """The name of its object, empty for beta."""
+        """The name of its object, "camera", or empty where it is the whole scene's."""
         return self.name.rpartition(".")[0]
 
     @property
     def is_global(self) -> bool:
-        """Whether it is one value for a whole object or scene (three for a colour)."""
-        return self.key != "vertices" and self.start.shape == ((3,) if self.key == "color" else ())
+        """Whether it is few values, for a whole object, scene or view."""
+        return self.per in ("object", "view")
+
+    @property
+    def moves(self) -> bool:
+        """Whether it moves surfaces or the camera."""
+        return self.key in MOTIONS
 
     @property
     def span(self) -> tuple[float, float]:
@@ -100,34 +126,95 @@ class Variable:
         # Rounding must not carry a bound across itself.
         return coordinate.exp().clamp(self.lower, self.upper) if self.logarithm else coordinate * self.unit
 
+    def in_view(self, value: Any, view: int) -> Any:
+        """Return what of a value belongs to a view, given its place among the fitted ones."""
+        stacked = self.per == "view" or (self.per == "pixel" and len(value.shape) == 3)
+        return value[view] if stacked else value
 
-def resolve_parameters(scene: Scene, parameters: Mapping[str, FitParameter]) -> tuple[Variable, ...]:
+
+def in_multiples_of_p(scene: Scene, values: Mapping[str, Any], where: str) -> tuple[Scene, dict[str, Any]]:
+    """Turn values such as "2P" into numbers, and their objects into ones whose thickness is in multiples of P(z).
+
+    Args:
+        scene: the scene.
+        values: by parameter name.
+        where: what they are, for messages.
+
+    Raises:
+        ValueError: a text that is not such a multiple, or one that is not for a thickness.
+    """
+    result, objects = {}, list(scene.objects)
+    for name, value in values.items():
+        if isinstance(value, str):
+            owner, _, key = name.rpartition(".")
+            match = MULTIPLE_OF_P.fullmatch(value) if key == "thickness" else None
+            if match is None:
+                expected = 'numbers or multiples of P(z) such as "2P"' if key == "thickness" else "numbers"
+                raise ValueError(f"{where}.{name}: found {shorten(value)}, expected {expected}")
+            value = float(match[1])
+            objects = [
+                replace(item, thickness=value, thickness_unit="P")
+                if owner in ("", item.name) and item.thickness_unit != "P"
+                else item
+                for item in objects
+            ]
+        result[name] = value
+    return replace(scene, objects=objects), result
+
+
+def thickness_units(scene: Scene, name: str) -> set[str]:
+    """Return the units that a thickness is in: one, or those of several objects."""
+    owner = name.rpartition(".")[0]
+    return {item.thickness_unit for item in scene.objects if owner in ("", item.name)}
+
+
+def resolve_parameters(
+    scene: Scene, cameras: Sequence[Camera], parameters: Mapping[str, FitParameter]
+) -> tuple[Variable, ...]:
     """Resolve parameters to fit against a scene.
+
+    Args:
+        scene: the scene.
+        cameras: those of the views that are fitted.
+        parameters: what to fit.
 
     Raises:
         ValueError: an unknown name, a start of the wrong shape, or one that is not between the bounds.
     """
-    known = scene.parameters()
     variables = []
     for name, parameter in parameters.items():
-        check_name(name, known, "parameters")
-        variables.append(_resolve(scene, name, known[name], parameter))
+        check_name(name, scene, "parameters")
+        variables.append(_resolve(scene, cameras, name, parameter))
+    if "thickness" in parameters and len({item.thickness_unit for item in scene.objects}) > 1:
+        found = "objects with thicknesses in scene units and in multiples of P(z)"
+        raise ValueError(f'parameters.thickness: found {found}, expected one unit (a start such as "2P" sets it)')
     return tuple(variables)
 
 
-def check_name(name: str, known: Mapping[str, Any], where: str) -> None:
+def check_name(name: str, scene: Scene, where: str) -> None:
     """Raise for a parameter that the scene does not have."""
+    known = {"thickness", *scene.parameters()}
     if name not in known:
         raise ValueError(f"{where}: found the unknown name {shorten(name)}; {suggest(name, known)}")
 
 
+def scene_value(scene: Scene, name: str) -> Any:
+    """Return a parameter's value in a scene; None for a thickness of all objects that is not one value."""
+    if name != "thickness":
+        return scene.parameters()[name]
+    values = [item.thickness for item in scene.objects]
+    same = all(np.ndim(value) == 0 and value == values[0] for value in values)
+    return values[0] if values and same else None
+
+
 def find_object(scene: Scene, name: str) -> SceneObject:
     """Return the object that a parameter belongs to."""
-    return next(item for item in scene.objects if item.name == name.rpartition(".")[0])
+    owner = name.rpartition(".")[0]
+    return next(item for item in scene.objects if item.name == owner)
 
 
 def extent(scene: Scene) -> float:
-    """Return the diagonal of the scene's bounding box [scene units]; 1 for a scene without vertices."""
+    """Return the diagonal of the bounding box of everything in the scene; 1 if it is empty."""
     vertices = [item.world_vertices() for item in scene.objects if len(item.vertices)]
     if not vertices:
         return 1.0
@@ -137,7 +224,7 @@ def extent(scene: Scene) -> float:
 
 def flatten_names(table: Mapping[str, Any], scene: Scene) -> dict[str, Any]:
     """Turn `ball.thickness = 1`, which TOML reads as a table in a table, into the name "ball.thickness"."""
-    names = {item.name for item in scene.objects}
+    names = {CAMERA, *(item.name for item in scene.objects)}
     flat: dict[str, Any] = {}
     for key, value in table.items():
         if key in names and isinstance(value, Mapping):
@@ -147,14 +234,15 @@ def flatten_names(table: Mapping[str, Any], scene: Scene) -> dict[str, Any]:
     return flat
 
 
-def _resolve(scene: Scene, name: str, current: Any, parameter: FitParameter) -> Variable:
+def _resolve(scene: Scene, cameras: Sequence[Camera], name: str, parameter: FitParameter) -> Variable:
     where = f"parameters.{name}"
     key = name.rpartition(".")[2]
-    start = _start(scene, name, current, parameter, where)
+    start, per = _start(scene, cameras, name, parameter, where)
     size, lower, upper = extent(scene), -math.inf, math.inf
     if key == "thickness":
-        lower, upper = _thickness_bounds(scene, find_object(scene, name), size)
-    elif key != "vertices":
+        items = scene.objects if name == "thickness" else [find_object(scene, name)]
+        lower, upper = _thickness_bounds(scene, items, size)
+    elif key not in MOTIONS:
         lower, upper = 0.0, 1.0
     lower = lower if parameter.lower is None else float(parameter.lower)
     upper = upper if parameter.upper is None else float(parameter.upper)
@@ -173,53 +261,86 @@ def _resolve(scene: Scene, name: str, current: Any, parameter: FitParameter) -> 
     rate = parameter.learning_rate
     if rate is not None and not (math.isfinite(rate) and rate > 0.0):
         raise ValueError(f"{where}.learning_rate: found {rate:g}, expected a number above 0")
-    unit = VERTEX_UNIT * size if key == "vertices" else 1.0
-    return Variable(name, start, lower, upper, key == "thickness", unit, rate)
+    _check_map_options(parameter, per, cameras, where)
+    unit = {"vertices": VERTEX_UNIT * size, "translation": VERTEX_UNIT * size, "rotation": math.degrees(1.0)}
+    return Variable(
+        *(name, start, lower, upper, per, key == "thickness", unit.get(key, 1.0), rate),
+        *(float(parameter.smoothness), parameter.levels),
+    )
 
 
-def _start(scene: Scene, name: str, current: Any, parameter: FitParameter, where: str) -> np.ndarray:
+def _check_map_options(parameter: FitParameter, per: Per, cameras: Sequence[Camera], where: str) -> None:
+    weight, levels = parameter.smoothness, parameter.levels
+    if not (math.isfinite(weight) and weight >= 0.0):
+        raise ValueError(f"{where}.smoothness: found {weight:g}, expected a number from 0")
+    if weight and per not in ("pixel", "vertex"):
+        raise ValueError(f'{where}.smoothness: found it with one value per {per}, expected per "pixel" or "vertex"')
+    if isinstance(levels, bool) or not isinstance(levels, int) or levels < 1:
+        raise ValueError(f"{where}.levels: found {shorten(levels)}, expected a whole number from 1")
+    if levels > 1 and per != "pixel":
+        raise ValueError(f'{where}.levels: found {levels} with one value per {per}, expected per "pixel"')
+    most = int(math.log2(max(cameras[0].size))) + 1
+    if levels > most:
+        raise ValueError(f"{where}.levels: found {levels}, expected up to {most} for an image of this size")
+
+
+def _start(
+    scene: Scene, cameras: Sequence[Camera], name: str, parameter: FitParameter, where: str
+) -> tuple[np.ndarray, Per]:
     key = name.rpartition(".")[2]
+    given = scene_value(scene, name) if parameter.start is None else parameter.start
+    if given is None:
+        raise ValueError(f"{where}.start: found none, expected a number (the objects' thicknesses differ)")
     try:
-        value = np.array(current if parameter.start is None else parameter.start, dtype=np.float64)
+        value = np.array(given, dtype=np.float64)
     except (TypeError, ValueError):
         raise ValueError(f"{where}.start: found {shorten(parameter.start)}, expected numbers") from None
     if not np.isfinite(value).all():
         raise ValueError(f"{where}.start: found a value that is not finite, expected finite numbers")
-    shapes = _shapes(scene, name, key)
+    shapes = _shapes(scene, cameras, name, key)
     if parameter.per is not None and parameter.per not in shapes:
         expected = " or ".join(f'"{per}"' for per in shapes)
         raise ValueError(f"{where}.per: found {shorten(parameter.per)}, expected {expected} for a {key}")
     if parameter.per is None:
-        if value.shape in shapes.values():
-            return value
+        for per, shape in shapes.items():
+            if value.shape == shape:
+                return value, per
         words = " or ".join(str(shape) for shape in shapes.values())
         raise ValueError(f"{where}.start: found shape {value.shape}, expected shape {words}")
     shape = shapes[parameter.per]
-    # One value, or one colour, stands for all vertices or pixels.
-    if value.shape not in (shape, next(iter(shapes.values()))):
+    if parameter.per == "pixel" and len({camera.size for camera in cameras}) > 1:
+        raise ValueError(f'{where}.per: found "pixel" with views of different sizes, expected one size')
+    # One value, or one colour, stands for all vertices or pixels; one map for those of all views.
+    stacked = parameter.per == "view" or len(shape) == 3
+    if value.shape not in (shape, shape[1:] if stacked else shape, next(iter(shapes.values()))):
         raise ValueError(f"{where}.start: found shape {value.shape}, expected shape {shape}")
-    return np.ascontiguousarray(np.broadcast_to(value, shape))
+    return np.ascontiguousarray(np.broadcast_to(value, shape)), parameter.per
 
 
-def _shapes(scene: Scene, name: str, key: str) -> dict[str, tuple[int, ...]]:
-    if key == "beta":
-        return {"object": ()}
+def _shapes(scene: Scene, cameras: Sequence[Camera], name: str, key: str) -> dict[Per, tuple[int, ...]]:
+    pixels = cameras[0].shape if len(cameras) == 1 else (len(cameras), *cameras[0].shape)
+    if name in ("beta", "thickness"):
+        return {"object": (), "pixel": pixels}
+    if key in ("translation", "rotation"):
+        by_view: dict[Per, tuple[int, ...]] = {"view": (len(cameras), 3)} if name.startswith(f"{CAMERA}.") else {}
+        return {"object": (3,), **by_view}
     count = len(find_object(scene, name).vertices)
-    last = (3,) if key in ("color", "vertices") else ()
     if key == "vertices":
         return {"vertex": (count, 3)}
-    shapes = {"object": last, "vertex": (count, *last)}
+    last = (3,) if key == "color" else ()
+    shapes: dict[Per, tuple[int, ...]] = {"object": last, "vertex": (count, *last)}
     if key == "thickness":
-        shapes["pixel"] = scene.camera.shape
+        shapes["pixel"] = pixels
     return shapes
 
 
-def _thickness_bounds(scene: Scene, item: SceneObject, size: float) -> tuple[float, float]:
+def _thickness_bounds(scene: Scene, items: Sequence[SceneObject], size: float) -> tuple[float, float]:
     lower, upper = SMALLEST_THICKNESS * size, LARGEST_THICKNESS * size
-    if item.thickness_unit == "P":
-        # In multiples of P(z) at the object's middle (FORMULAS 11, 24 bits).
+    if items and items[0].thickness_unit == "P":
+        # In multiples of P(z) at the objects' middle (FORMULAS 11, 24 bits).
         camera, step = scene.camera, 2.0**-24
-        middle = item.world_vertices().mean(axis=0) if len(item.vertices) else np.asarray(camera.target)
+        vertices = [item.world_vertices() for item in items if len(item.vertices)]
+        middle = np.concatenate(vertices).mean(axis=0) if vertices else np.asarray(camera.target)
         z = max(float((camera.view_matrix()[:3, :3] @ (middle - np.asarray(camera.eye)))[2]), camera.near)
         resolution = z * z * step / (camera.near * camera.far / (camera.far - camera.near) + z * step)
         return lower / resolution, upper / resolution
@@ -249,6 +370,3 @@ def component_names(variables: Sequence[Variable]) -> list[str]:
         single = variable.start.ndim == 0
         names += [variable.name] if single else [f"{variable.name}[{index}]" for index in range(count)]
     return names
-
-
-__all__ = ["PARAMETER_KEYS", "FitParameter", "Per", "Variable", "resolve_parameters"]

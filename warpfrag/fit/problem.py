@@ -1,90 +1,118 @@
-"""The image as a function of the fitted parameters, and the reference it is compared with.
+"""The images as functions of the fitted parameters, and the references they are compared with.
 
-While only beta and one thickness, opacity or colour per object change, coverage, depth and interpolated attributes
-stay: the scene is captured once, with ones in place of the fitted values. A fragment's thickness is then that of the
-capture (1, or P(z)) times the object's value, its premultiplied colour that of the capture times colour and opacity.
+While nothing moves, what each pixel sees stays: a view is captured once, and only shaded and composited in each step.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from warpfrag.capture.capture import capture
+from warpfrag.capture.coverage import Coverage
 from warpfrag.capture.kbuffer import capture_kbuffer
 from warpfrag.capture.render import render
 from warpfrag.composite import composite
-from warpfrag.fit.parameters import Variable
-from warpfrag.fit.study import Study, StudyError
+from warpfrag.fit.frozen import UnitFragments
+from warpfrag.fit.parameters import in_multiples_of_p
+from warpfrag.fit.processes import Processes
+from warpfrag.fit.study import RENDER_OPTIONS, Study, StudyError, View, true_of_view
 from warpfrag.fragments import Fragments
 from warpfrag.interop.operator import kind_of
 from warpfrag.resolve.kbuffer import kbuffer
 from warpfrag.scene.objects import Scene
 
-
-class FrozenGeometry:
-    """The fragments of a scene as functions of one value per object.
-
-    Args:
-        scene: the scene.
-        variables: what will be given to `scaled`, all global.
-        sort: whether the fragments are to be sorted by depth, or in order of submission.
-    """
-
-    def __init__(self, scene: Scene, variables: Sequence[Variable], sort: bool = True) -> None:
-        ones = {v.name: np.ones(v.start.shape, np.float32) for v in variables if v.key != "beta"}
-        self.fragments: Fragments = capture(scene, parameters=ones, sort=sort).numpy()
-        owners = {variable.owner for variable in variables}
-        self.masks: dict[str, Any] = {
-            item.name: self.fragments.object_id == index
-            for index, item in enumerate(scene.objects)
-            if item.name in owners
-        }
-
-    def torch(self, device: Any) -> "FrozenGeometry":
-        """Return the same with torch tensors on a device."""
-        import torch
-
-        other = object.__new__(FrozenGeometry)
-        other.fragments = self.fragments.torch(device)
-        other.masks = {name: torch.as_tensor(mask, device=device) for name, mask in self.masks.items()}
-        return other
-
-    def scaled(self, values: Mapping[str, Any]) -> Fragments:
-        """Return the fragments for parameter values, of the kind of the fragments; tensors keep their gradient."""
-        xp = _namespace(self.fragments.rgba)
-        rgba, thickness = self.fragments.rgba, self.fragments.thickness
-        # Selected by masks, not gathered by index: the gradient is then a plain sum, the same bits every time.
-        for owner, mask in self.masks.items():
-            opacity, color = values.get(f"{owner}.opacity"), values.get(f"{owner}.color")
-            if color is not None:
-                whole = xp.concatenate([color, xp.ones_like(color[:1])])
-                rgba = xp.where(mask[:, None], rgba * whole, rgba)
-            if opacity is not None:
-                rgba = xp.where(mask[:, None], rgba * opacity, rgba)
-            if f"{owner}.thickness" in values:
-                thickness = xp.where(mask, thickness * values[f"{owner}.thickness"], thickness)
-        return replace(self.fragments, rgba=rgba, thickness=thickness)
+# Random starts keep this share of the range away from the bounds.
+_MARGIN = 0.1
 
 
-class Problem:
-    """What a study compares: images for parameter values, and the reference.
+class ViewProblem:
+    """One view of a study: its image for parameter values, and the reference.
 
     Args:
         study: the study.
+        view: the view.
+        index: its place among the fitted views; 0 for one that is held out, for which no value is stacked.
 
     Raises:
         StudyError: the reference image has another size than the camera.
     """
 
-    def __init__(self, study: Study) -> None:
-        self.study, self.scene = study, study.scene
-        self.reference = reference_image(study)
+    def __init__(self, study: Study, view: View, index: int) -> None:
+        self.study, self.view, self.index = study, view, index
+        self.scene = replace(study.fitted_scene, camera=view.camera)
+        self.moves = any(variable.moves for variable in study.variables)
+        self.reference = reference_image(study, view, index)
         self.channels = self.reference.shape[2]
         self.background = np.asarray(self.scene.background, np.float32)
-        sort = study.resolve == "sorted"
-        self.frozen = FrozenGeometry(self.scene, study.variables, sort) if study.is_global else None
+
+    @cached_property
+    def coverage(self) -> Coverage:
+        """What each pixel sees, where nothing moves."""
+        return Coverage.of(self.scene, sort=self.study.resolve == "sorted")
+
+    @cached_property
+    def unit(self) -> UnitFragments:
+        """The fragments as functions of few values per object, where nothing moves."""
+        return UnitFragments(self.scene, self.coverage, self.study.variables)
+
+    @cached_property
+    def fragments(self) -> Fragments:
+        """The fragments of the scene as it is, where only beta is fitted."""
+        return self.coverage.shade()
+
+    def parameters(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Return this view's part of parameter values, in single precision."""
+        return {v.name: _single(v.in_view(values[v.name], self.index)) for v in self.study.variables}
+
+    def image(self, values: Mapping[str, Any]) -> Any:
+        """Return the image for parameter values, (H, W, 4) float32; torch tensors get their gradient."""
+        parameters = self.parameters(values)
+        if self.moves:
+            return render_scene(self.scene, self.study.resolve, parameters)
+        beta = parameters.pop("beta", float(self.scene.beta))
+        fragments = self.coverage.shade(parameters) if parameters else self.fragments
+        if kind_of(beta) == "torch" and kind_of(fragments.rgba) == "numpy":
+            fragments = fragments.torch(beta.device)
+        return self.over_background(self.composite(fragments, beta))
+
+    def composite(self, fragments: Fragments, beta: Any) -> Any:
+        """Composite fragments as the scene says, without its background."""
+        scene = self.scene
+        if self.study.resolve == "kbuffer":
+            return composite(kbuffer(fragments, scene.layers, merge=scene.merge))  # type: ignore[arg-type]
+        return composite(fragments, beta, max_layers=scene.layers, merge=scene.merge, mix=scene.mix)
+
+    def over_background(self, image: Any) -> Any:
+        """Return a premultiplied image, an array or a tensor, over the scene's background."""
+        return _over(image, self.background)
+
+    def residual(self, image: Any) -> Any:
+        """Return image minus reference, (H, W, C), an array or a tensor."""
+        return image[..., : self.channels] - _like(self.reference, image)
+
+    def loss(self, image: Any) -> Any:
+        """Return the study's loss of a torch image, a 0-d float64 tensor."""
+        return self.study.image_loss(image[..., : self.channels], _like(self.reference, image))
+
+
+class Problem:
+    """What a study compares: its views, and the vector of coordinates that a method moves.
+
+    Args:
+        study: the study.
+        processes: those that share the work; None for a single one.
+
+    Raises:
+        StudyError: a reference image has another size than its camera.
+    """
+
+    def __init__(self, study: Study, processes: Processes | None = None) -> None:
+        self.study, self.processes = study, processes or Processes(study.device)
+        fitted = study.fitted_views
+        self.views = [ViewProblem(study, view, index) for index, view in enumerate(fitted)]
+        self.held_out = [ViewProblem(study, view, 0) for view in study.all_views if view.held_out]
 
     def values(self, coordinates: np.ndarray) -> dict[str, np.ndarray]:
         """Return the parameters for a vector of a method's coordinates."""
@@ -105,36 +133,24 @@ class Problem:
         lower, upper = np.concatenate(spans).T
         return lower, upper
 
-    def over_background(self, image: Any) -> Any:
-        """Return a premultiplied image, an array or a tensor, over the scene's background."""
-        if not self.background.any():
-            return image
-        return image + (1.0 - image[..., 3:]) * _like(self.background, image)
+    def starts(self) -> list[np.ndarray]:
+        """Return the study's start and the random ones.
 
-    def composite(self, fragments: Fragments, beta: Any) -> Any:
-        """Composite fragments as the scene says, without its background."""
-        scene = self.scene
-        if self.study.resolve == "kbuffer":
-            return composite(kbuffer(fragments, scene.layers, merge=scene.merge))  # type: ignore[arg-type]
-        return composite(fragments, beta, max_layers=scene.layers, merge=scene.merge, mix=scene.mix)
-
-    def image(self, values: Mapping[str, Any], frozen: FrozenGeometry | None = None) -> Any:
-        """Return the image for parameter values, (H, W, 4) float32.
-
-        Args:
-            values: arrays; or torch tensors, in which the image is then differentiable.
-            frozen: the frozen geometry as tensors, if the values are.
+        What is fitted per vertex, pixel or view starts from one value everywhere; what has no bounds from the study's.
         """
-        single = {name: _single(value) for name, value in values.items()}
-        frozen = frozen or self.frozen
-        if frozen is None:
-            return render_scene(self.scene, self.study.resolve, single)
-        beta = single.get("beta", float(self.scene.beta))
-        return self.over_background(self.composite(frozen.scaled(single), beta))
-
-    def residual(self, image: Any) -> Any:
-        """Return image minus reference, (H, W, C), an array or a tensor."""
-        return image[..., : self.channels] - _like(self.reference, image)
+        generator = np.random.default_rng(self.study.seed)
+        lower, upper = self.bounds()
+        starts = [np.clip(self.start(), lower, upper)]
+        for _ in range(self.study.restarts):
+            parts = []
+            for variable in self.study.variables:
+                low, high = variable.span
+                one = (3,) if variable.key == "color" or variable.moves else ()
+                share = generator.uniform(_MARGIN, 1.0 - _MARGIN, one)
+                start = variable.inward(variable.start) if np.isinf(low) else low + share * (high - low)
+                parts.append(np.broadcast_to(start, variable.start.shape).reshape(-1))
+            starts.append(np.concatenate(parts))
+        return starts
 
 
 def _namespace(array: Any) -> Any:
@@ -154,23 +170,34 @@ def _single(value: Any) -> Any:
     return value.float() if kind_of(value) == "torch" else np.asarray(value, np.float32)
 
 
+def _over(image: Any, background: np.ndarray) -> Any:
+    if not background.any():
+        return image
+    return image + (1.0 - image[..., 3:]) * _like(background, image)
+
+
 def render_scene(scene: Scene, resolve: str, parameters: Mapping[str, Any]) -> Any:
     """Render a scene as `Study.resolve` says."""
     if resolve == "sorted":
         return render(scene, parameters=parameters)
     layers = capture_kbuffer(scene, slots=scene.layers, merge=scene.merge, parameters=parameters)  # type: ignore[arg-type]
-    image = composite(layers)
-    return image + (1.0 - image[..., 3:]) * _like(np.asarray(scene.background, np.float32), image)
+    return _over(composite(layers), np.asarray(scene.background, np.float32))
 
 
-def reference_image(study: Study) -> np.ndarray:
-    """Return the image a study approaches, (H, W, 3 or 4) float32.
+def reference_image(study: Study, view: View, index: int = 0) -> np.ndarray:
+    """Return the image that a view approaches, (H, W, 3 or 4) float32.
+
+    Args:
+        study: the study.
+        view: the view.
+        index: its place among the fitted views.
 
     Raises:
         StudyError: it has another size than the camera.
     """
-    reference, scene = study.reference, study.scene
-    height, width = scene.camera.shape
+    reference, scene = view.reference, replace(study.scene, camera=view.camera)
+    assert reference is not None
+    height, width = view.camera.shape
     if reference.image is not None:
         image = np.asarray(reference.image, np.float32)
         if image.ndim != 3 or image.shape[2] not in (3, 4) or not np.isfinite(image).all():
@@ -186,9 +213,10 @@ def reference_image(study: Study) -> np.ndarray:
             image = image + (1.0 - image[..., 3:]) * np.asarray(scene.background, np.float32)
         return image
     samples = reference.supersampling
-    options = {key: getattr(reference, key) or getattr(scene, key) for key in ("merge", "mix", "layers")}
-    fine = replace(scene, camera=scene.camera.resized((width * samples, height * samples)), **options)
-    image = np.asarray(render_scene(fine, study.resolve, dict(reference.true or {})))
+    options = {key: getattr(reference, key) or getattr(scene, key) for key in RENDER_OPTIONS}
+    fine = replace(scene, camera=view.camera.resized((width * samples, height * samples)), **options)
+    fine, true = in_multiples_of_p(fine, true_of_view(reference, index, len(study.fitted_views)), "reference.true")
+    image = np.asarray(render_scene(fine, study.resolve, true))
     if samples > 1:
         image = image.reshape(height, samples, width, samples, 4).mean(axis=(1, 3), dtype=np.float64)
     return np.ascontiguousarray(image, np.float32)

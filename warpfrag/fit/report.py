@@ -9,26 +9,26 @@ from warpfrag.extras import need
 from warpfrag.saving import replacing
 
 if TYPE_CHECKING:
-    from warpfrag.fit.result import FitResult
+    from warpfrag.fit.result import FitResult, ViewResult
 
 _DPI = 150
 _STYLE = {"font.size": 9.0, "axes.titlesize": 10.0, "axes.linewidth": 0.6, "figure.dpi": _DPI, "savefig.dpi": _DPI}
 
 
-def draw_error(result: "FitResult", path: Path) -> None:
+def draw_error(view: "ViewResult", path: Path) -> None:
     """Draw the absolute error of each pixel, its largest over the channels, at the start and at the end.
 
     Args:
-        result: the fit.
+        view: the view, before and after the fit.
         path: the PNG file.
     """
     matplotlib, figure_class = _matplotlib()
-    channels = result.reference.shape[2]
+    channels = view.reference.shape[2]
     panels = [
-        (title, np.abs(image[..., :channels] - result.reference))
-        for title, image in (("at the start", result.before), ("at the end", result.after))
+        (title, np.abs(image[..., :channels] - view.reference))
+        for title, image in (("at the start", view.before), ("at the end", view.after))
     ]
-    height, width = result.reference.shape[:2]
+    height, width = view.reference.shape[:2]
     # Panels 4 inches wide, higher or lower as the image is, within reason.
     tall = float(np.clip(4.0 * height / width, 2.0, 7.0))
     label = "|image − reference|, largest of the channels, linear light"

@@ -11,12 +11,60 @@ from typing import Any
 
 import numpy as np
 
+from warpfrag.fit.losses import psnr
 from warpfrag.fit.parameters import value_words
 from warpfrag.images import write_image
 from warpfrag.saving import replacing
 
 # Arrays with more numbers than this are written beside result.json, not into it.
 MOST_NUMBERS = 256
+
+
+@dataclass(frozen=True, eq=False)
+class ViewResult:
+    """A view before and after a fit.
+
+    Attributes:
+        name: the view's name.
+        held_out: whether it was only compared, not fitted.
+        reference: the image to approach, (H, W, 3 or 4), linear premultiplied.
+        before: the image at the start, (H, W, 4).
+        after: the image found, (H, W, 4).
+    """
+
+    name: str
+    held_out: bool
+    reference: np.ndarray = field(repr=False)
+    before: np.ndarray = field(repr=False)
+    after: np.ndarray = field(repr=False)
+
+    @property
+    def psnr(self) -> float:
+        """Peak signal-to-noise ratio of the colours found [dB], in linear light; inf where they are equal."""
+        return psnr(self.after, self.reference)
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A fit from one of the starts.
+
+    Attributes:
+        start: parameters at the start, by name: floats and float64 arrays.
+        found: parameters of the least loss.
+        loss: the least loss.
+        losses: the loss of each step.
+        evaluations: times that the images were computed.
+        converged: whether the stopping rule ended it.
+        reason: why it ended.
+    """
+
+    start: dict[str, Any] = field(repr=False)
+    found: dict[str, Any]
+    loss: float
+    losses: tuple[float, ...] = field(repr=False)
+    evaluations: int
+    converged: bool
+    reason: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,14 +80,13 @@ class FitResult:
         condition_number: of the Jacobian (thicknesses as logarithms); None unless every parameter is global.
         undetermined: names of the parameters the image does not determine, see `warpfrag.fit.outcome.assess`.
         loss: the least loss.
-        losses: the loss of each step.
-        evaluations: images computed.
+        losses: the loss of each step from the start that led there.
+        evaluations: times that the images were computed, from all starts.
         seconds: time the fit took.
         converged: whether the stopping rule ended it.
         reason: why it ended.
-        reference: the image to approach, (H, W, 3 or 4), linear premultiplied.
-        before: the image at the start, (H, W, 4).
-        after: the image found, (H, W, 4).
+        views: the views before and after, those held out last.
+        runs: the fits from all starts, the study's own first.
         setting: how it was fitted: method, loss, size, and so on.
     """
 
@@ -55,10 +102,24 @@ class FitResult:
     seconds: float
     converged: bool
     reason: str
-    reference: np.ndarray = field(repr=False)
-    before: np.ndarray = field(repr=False)
-    after: np.ndarray = field(repr=False)
+    views: tuple[ViewResult, ...] = field(repr=False)
+    runs: tuple[Run, ...] = field(repr=False)
     setting: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def reference(self) -> np.ndarray:
+        """The first view's image to approach, (H, W, 3 or 4), linear premultiplied."""
+        return self.views[0].reference
+
+    @property
+    def before(self) -> np.ndarray:
+        """The first view's image at the start, (H, W, 4)."""
+        return self.views[0].before
+
+    @property
+    def after(self) -> np.ndarray:
+        """The first view's image found, (H, W, 4)."""
+        return self.views[0].after
 
     @property
     def steps(self) -> int:
@@ -89,6 +150,10 @@ class FitResult:
             if any(part == name or part.startswith(f"{name}[") for part in self.undetermined):
                 line += " — not determined by this image"
             lines.append(line)
+        if len(self.views) > 1:
+            lines += [f"{v.name}{' (held out)' if v.held_out else ''}: PSNR {v.psnr:.2f} dB" for v in self.views]
+        if len(self.runs) > 1:
+            lines.append(f"losses from {len(self.runs)} starts: " + ", ".join(f"{run.loss:.3g}" for run in self.runs))
         state = "converged" if self.converged else "stopped"
         end = f"{state}: {self.reason}; loss {self.loss:.3g}, {self.steps} steps, {self.seconds:.1f} s"
         if self.condition_number is not None:
@@ -112,12 +177,26 @@ class FitResult:
             "seconds": self.seconds,
             "converged": self.converged,
             "reason": self.reason,
+            "views": [_plain({"name": v.name, "held_out": v.held_out, "psnr": v.psnr}) for v in self.views],
+            "runs": [self._run_to_json(index, run, arrays) for index, run in enumerate(self.runs)],
             **_plain(self.setting),
             "versions": _versions(),
         }
 
+    @staticmethod
+    def _run_to_json(index: int, run: Run, arrays: dict[str, np.ndarray] | None) -> dict[str, Any]:
+        return {
+            "start": _plain_values(f"runs.{index}.start", run.start, arrays),
+            "found": _plain_values(f"runs.{index}.found", run.found, arrays),
+            "loss": _plain(run.loss),
+            "steps": len(run.losses),
+            "evaluations": run.evaluations,
+            "converged": run.converged,
+            "reason": run.reason,
+        }
+
     def save(self, folder: str | Path) -> None:
-        """Write images, plots and result.json to a folder, made if need be.
+        """Write images, plots and result.json to a folder, made if need be; the images of several views to one each.
 
         Raises:
             ImageError: a file cannot be written.
@@ -127,9 +206,12 @@ class FitResult:
 
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        for name in ("reference", "before", "after"):
-            write_image(folder / f"{name}.png", getattr(self, name))
-        draw_error(self, folder / "error.png")
+        for view in self.views:
+            place = folder / view.name if len(self.views) > 1 else folder
+            place.mkdir(exist_ok=True)
+            for name in ("reference", "before", "after"):
+                write_image(place / f"{name}.png", getattr(view, name))
+            draw_error(view, place / "error.png")
         draw_loss(self, folder / "loss.png")
         arrays: dict[str, np.ndarray] = {}
         content = self.to_json(arrays)

@@ -11,9 +11,11 @@ import numpy as np
 
 from warpfrag.extras import need
 from warpfrag.fit.bar import progress_bar
-from warpfrag.fit.result import FitResult, plain_value
+from warpfrag.fit.processes import is_first_process
+from warpfrag.fit.result import FitResult, Run, ViewResult, plain_value
 from warpfrag.fit.session import CHECKPOINT, FitError, Progress, Session, fingerprint
-from warpfrag.fit.study import Study, load_study
+from warpfrag.fit.study import Study
+from warpfrag.fit.study_file import load_study
 from warpfrag.saving import remove_partial
 
 
@@ -24,11 +26,14 @@ def fit(
     output: str | os.PathLike | None = None,
     progress: Callable[[Progress], None] | bool | None = None,
 ) -> FitResult:
-    """Fit the parameters of a scene to an image.
+    """Fit the parameters of a scene to one image or several.
 
     With few values per object the default is bounded least squares with the exact Jacobian (see `fit.jacobian`); Adam
-    and L-BFGS take any parameters. Coverage is held fixed in gradients: vertices move by what they do to depth and
-    attributes inside of triangles.
+    and L-BFGS take any parameters. Coverage is held fixed in gradients: vertices, transforms and cameras move by what
+    they do to depth and attributes inside of triangles; the images themselves are always those of the moved scene.
+
+    Started by `torchrun`, the processes share the views among themselves and come to the same result as one, to
+    rounding; only the first of them writes files and shows progress.
 
     Args:
         study: a study, or the path of a study file.
@@ -63,45 +68,46 @@ def fit(
         need("matplotlib", "fit", "The report of a fit")
         output = Path(output)
         output.mkdir(parents=True, exist_ok=True)
-        remove_partial(output)
-    with progress_bar(study.name) if progress is True else nullcontext(progress or None) as report:
-        result = _run(study, resume, output, report)
-    if output is not None:
+        if is_first_process():
+            remove_partial(output)
+    first = is_first_process()
+    with progress_bar(study.name) if progress is True and first else nullcontext(progress or None) as report:
+        result = _run(study, resume, output, report if callable(report) else None)
+    if output is not None and first:
         result.save(output)
     return result
 
 
 def _run(study: Study, resume: bool, output: Path | None, report: Callable[[Progress], None] | None) -> FitResult:
-    from warpfrag.fit.descent import adam, lbfgs
-    from warpfrag.fit.least_squares import least_squares
-    from warpfrag.fit.outcome import assess
+    from warpfrag.fit.descent import LBFGS, Adam
+    from warpfrag.fit.least_squares import LeastSquares
     from warpfrag.fit.problem import Problem
 
     started = time.monotonic()
     problem = Problem(study)
-    session = Session(study, fingerprint(study, problem.reference), output, report, started)
+    digest = fingerprint(study, [view.reference for view in problem.views])
+    session = Session(study, digest, output, report, started, is_first_process())
     if resume:
         session.load()
-    before = problem.image(problem.values(problem.start()))
-    methods: dict[str, Any] = {"least_squares": least_squares, "adam": adam, "lbfgs": lbfgs}
+    before = _images(problem, problem.values(problem.start()))
+    methods: dict[str, Any] = {"least_squares": LeastSquares, "adam": Adam, "lbfgs": LBFGS}
+    runs, outcomes = [], []
     with session.interruptible():
-        outcome = methods[str(study.method)](problem, session)
+        method = methods[str(study.method)](problem, session)
+        for start in problem.starts():
+            begin = len(session.losses)
+            outcome = method.run(start)
+            outcomes.append(outcome)
+            runs.append(_describe(problem, start, outcome, tuple(session.losses[begin:])))
         session.save()
-    found = problem.values(outcome.coordinates)
-    after = problem.image(found)
-    errors: dict[str, Any] | None = None
-    condition: float | None = None
-    undetermined: tuple[str, ...] = ()
-    if outcome.compressed is not None and problem.frozen is not None:
-        covered = np.count_nonzero(np.diff(problem.frozen.fragments.offsets)) * problem.channels
-        certainty = assess(outcome.compressed, study.variables, problem.reference.size, covered)
-        errors, condition, undetermined = {}, certainty.condition_number, certainty.undetermined
-        first = 0
-        for variable in study.variables:
-            last = first + variable.start.size
-            error = certainty.standard_errors[first:last].reshape(variable.start.shape)
-            errors[variable.name] = plain_value(error * (found[variable.name] if variable.logarithm else 1.0))
-            first = last
+    best = min(range(len(runs)), key=lambda index: outcomes[index].loss)
+    found = problem.values(outcomes[best].coordinates)
+    errors, condition, undetermined = _certainty(problem, outcomes[best].coordinates, found)
+    after = _images(problem, found)
+    views = [
+        ViewResult(view.view.name, view.view.held_out, view.reference, *images)
+        for view, *images in zip([*problem.views, *problem.held_out], before, after, strict=True)
+    ]
     true = study.true
     return FitResult(
         start={variable.name: plain_value(variable.start) for variable in study.variables},
@@ -110,32 +116,76 @@ def _run(study: Study, resume: bool, output: Path | None, report: Callable[[Prog
         standard_errors=errors,
         condition_number=condition,
         undetermined=undetermined,
-        loss=outcome.loss,
-        losses=tuple(session.losses),
-        evaluations=outcome.evaluations,
+        loss=outcomes[best].loss,
+        losses=runs[best].losses,
+        evaluations=sum(outcome.evaluations for outcome in outcomes),
         seconds=session.seconds,
-        converged=outcome.converged,
-        reason=outcome.reason,
-        reference=problem.reference,
-        before=np.asarray(before),
-        after=np.asarray(after),
-        setting=_setting(study),
+        converged=outcomes[best].converged,
+        reason=outcomes[best].reason,
+        views=tuple(views),
+        runs=tuple(runs),
+        setting=_setting(study, problem.processes.count),
     )
 
 
-def _setting(study: Study) -> dict[str, Any]:
-    scene = study.scene
+def _images(problem: Any, values: dict[str, Any]) -> list[np.ndarray]:
+    return [np.asarray(view.image(values)) for view in (*problem.views, *problem.held_out)]
+
+
+def _describe(problem: Any, start: np.ndarray, outcome: Any, losses: tuple[float, ...]) -> Run:
+    begin, end = problem.values(start), problem.values(outcome.coordinates)
+    return Run(
+        start={name: plain_value(value) for name, value in begin.items()},
+        found={name: plain_value(value) for name, value in end.items()},
+        loss=outcome.loss,
+        losses=losses,
+        evaluations=outcome.evaluations,
+        converged=outcome.converged,
+        reason=outcome.reason,
+    )
+
+
+def _certainty(
+    problem: Any, coordinates: np.ndarray, found: dict[str, Any]
+) -> tuple[dict[str, Any] | None, float | None, tuple[str, ...]]:
+    """Return standard errors, condition number and what is undetermined; nothing where some parameter is not global."""
+    from warpfrag.fit.jacobian import Evaluation
+    from warpfrag.fit.losses import RobustLoss
+    from warpfrag.fit.outcome import assess
+
+    study = problem.study
+    if not study.is_global:
+        return None, None, ()
+    evaluation = Evaluation(problem, study.image_loss.robust or RobustLoss.named("l2", study.delta), coordinates)
+    residual_count = sum(view.reference.size for view in problem.views)
+    certainty = assess(evaluation.compress(), study.variables, residual_count, evaluation.covered_count)
+    errors, first = {}, 0
+    for variable in study.variables:
+        last = first + variable.start.size
+        error = certainty.standard_errors[first:last].reshape(variable.start.shape)
+        errors[variable.name] = plain_value(error * (found[variable.name] if variable.logarithm else variable.unit))
+        first = last
+    return errors, certainty.condition_number, certainty.undetermined
+
+
+def _setting(study: Study, processes: int) -> dict[str, Any]:
+    scene, loss = study.fitted_scene, study.loss
+    words = loss if isinstance(loss, str) else " + ".join(f"{weight:g} {name}" for name, weight in loss.items())
     return {
         "study": study.name,
         "method": study.method,
-        "loss_name": study.loss,
-        "size": list(scene.camera.size),
+        "loss_name": words,
+        "scales": study.scales,
+        "size": list(study.all_views[0].camera.size),
         "resolve": study.resolve,
         "merge": scene.merge,
         "mix": scene.mix,
         "layers": scene.layers,
         "tolerance": study.tolerance,
+        "patience": study.patience,
+        "batch": study.batch,
         "seed": study.seed,
         "restarts": study.restarts,
         "device": study.device,
+        "processes": processes,
     }

@@ -12,7 +12,7 @@ import hashlib
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType
@@ -26,7 +26,7 @@ from warpfrag.saving import replacing
 
 CHECKPOINT = "checkpoint.dat"
 # Of the file's layout; another one is not read.
-_VERSION = 1
+_VERSION = 2
 
 
 class FitError(ValueError):
@@ -38,9 +38,9 @@ class Progress:
     """What a fit reports after each step.
 
     Attributes:
-        step: steps done: evaluations of least squares, iterations of the other methods.
+        step: steps done: evaluations of least squares, iterations of the other methods; of all starts together.
         steps: most steps.
-        loss: the loss of this step.
+        loss: the loss of this step; with a batch of views theirs alone.
         parameters: the values of this step, by name.
         message: something to tell the user, such as what Ctrl-C has begun; empty for a step that is done.
     """
@@ -59,6 +59,7 @@ class Session:
         study: the study.
         fingerprint: of the study, see `fingerprint`.
         folder: where the checkpoint goes; None writes none.
+        writes: whether this process is the one that writes and reports.
         report: called after each step.
         started: when the fit began, by the monotonic clock.
     """
@@ -70,8 +71,10 @@ class Session:
         folder: Path | None,
         report: Callable[[Progress], None] | None,
         started: float,
+        writes: bool = True,
     ) -> None:
-        self.study, self.fingerprint, self.folder, self.report = study, fingerprint, folder, report
+        self.study, self.fingerprint, self.folder = study, fingerprint, folder
+        self.writes, self.report = writes, report if writes else None
         self.losses: list[float] = []
         self.state: dict[str, Any] = {}
         self.seconds_before = 0.0
@@ -105,7 +108,7 @@ class Session:
 
     def save(self) -> None:
         """Write the checkpoint."""
-        if self.folder is None:
+        if self.folder is None or not self.writes:
             return
         content = {**self.state, "version": _VERSION, "fingerprint": self.fingerprint, "seconds": self.seconds}
         with replacing(self.folder / CHECKPOINT) as partial, partial.open("wb") as file:
@@ -133,7 +136,8 @@ class Session:
         if self.folder is not None and (due or self.interrupted):
             self.state = state()
             self.save()
-        self.last = Progress(len(self.losses), int(self.study.steps or 0), loss, dict(values))
+        steps = int(self.study.steps or 0) * (1 + self.study.restarts)
+        self.last = Progress(len(self.losses), steps, loss, dict(values))
         if self.report is not None:
             self.report(self.last)
         if self.interrupted:
@@ -186,8 +190,13 @@ def check_finite(step: int, loss: float, values: Mapping[str, Any], gradients: M
         raise FitError(f"step {step}: the loss is {loss:g} at {values_words(values)}")
 
 
-def fingerprint(study: Study, reference: np.ndarray) -> str:
-    """Return a digest of all that decides the numbers of a fit, but for how long it goes on."""
+def fingerprint(study: Study, references: Sequence[np.ndarray]) -> str:
+    """Return a digest of all that decides the numbers of a fit, but for how long it goes on.
+
+    Args:
+        study: the study.
+        references: the images of the views that are fitted.
+    """
     digest = hashlib.sha256()
 
     def add(*things: Any) -> None:
@@ -197,8 +206,9 @@ def fingerprint(study: Study, reference: np.ndarray) -> str:
             if array:
                 digest.update(np.ascontiguousarray(thing).tobytes())
 
-    scene = study.scene
-    add(scene.camera, scene.background, scene.beta, scene.layers, scene.merge, scene.mix, study.resolve, reference)
+    scene = study.fitted_scene
+    add(scene.background, scene.beta, scene.layers, scene.merge, scene.mix, study.resolve)
+    add(*(view.camera for view in study.fitted_views), *references)
     for item in scene.objects:
         add(item.name, item.thickness_unit, item.faces, item.matrix)
         for value in (item.vertices, item.color, item.opacity, item.thickness, item.uv, item.texture_index, item.shade):
@@ -206,14 +216,10 @@ def fingerprint(study: Study, reference: np.ndarray) -> str:
         add(*item.textures)
     for variable in study.variables:
         add(variable.name, variable.start, variable.lower, variable.upper, variable.unit, variable.learning_rate)
-    add(
-        study.loss,
-        study.delta,
-        study.method,
-        study.seed,
-        study.restarts,
-        study.learning_rate,
-        study.tolerance,
-        study.device,
-    )
+        add(variable.per, variable.smoothness, variable.levels)
+    add(study.image_loss, study.method, study.seed, study.restarts, study.learning_rate, study.tolerance, study.device)
+    add(study.patience, study.batch)
+    if any(variable.levels > 1 for variable in study.variables):
+        # How many steps there are then decides when the stages change.
+        add(study.steps)
     return digest.hexdigest()

@@ -1,70 +1,38 @@
-"""Studies: what is fitted to which image, and how; and the TOML files that describe them.
+"""Studies: what is fitted to which images, and how. `study_file` reads them from TOML."""
 
-A study file:
-
-scene = "../three_spheres.toml"       # relative to the study file
-method = "least_squares"              # or "adam", "lbfgs"; loss, delta, steps, tolerance, seed, restarts, …
-size = [256, 256]                     # and merge, mix, layers: in place of the scene's own
-resolve = "kbuffer"                   # how images come about; default "sorted"
-
-[reference]
-true = {beta = 0.5, red.thickness = 0.15}     # a render of the scene with these values; or image = "photo.png"
-
-[parameters]
-beta = 0.9                                              # where to start
-red.thickness = {start = 0.4, lower = 0.01, upper = 2}  # and between which bounds
-"""
-
-import math
-import os
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
 
+from warpfrag.fit.losses import ImageLoss
 from warpfrag.fit.parameters import (
-    PER,
     FitParameter,
     Variable,
     check_name,
-    find_object,
-    flatten_names,
+    in_multiples_of_p,
     resolve_parameters,
+    scene_value,
+    thickness_units,
 )
-from warpfrag.images import ImageError, read_image
-from warpfrag.scene.colors import parse_hex
-from warpfrag.scene.errors import SceneError, shorten
-from warpfrag.scene.files import load_scene
+from warpfrag.scene.camera import Camera
+from warpfrag.scene.errors import shorten
 from warpfrag.scene.geometry import assemble
-from warpfrag.scene.objects import MERGES, MIXES, Scene
-from warpfrag.scene.table import Table, is_number, is_numbers, read_toml
+from warpfrag.scene.objects import Scene
+from warpfrag.scene.table import is_number
 
 Method = Literal["least_squares", "adam", "lbfgs"]
-Loss = Literal["l2", "l1", "huber"]
 Resolve = Literal["sorted", "kbuffer"]
 
 # Steps a method takes at most unless told: evaluations of least squares, iterations of the others.
 DEFAULT_STEPS = {"least_squares": 100, "adam": 300, "lbfgs": 100}
+# Adam stops when the best loss of so many steps is not better than the best before them, L-BFGS after so many steps in
+# a row that changed nothing.
+DEFAULT_PATIENCE = {"least_squares": 1, "adam": 50, "lbfgs": 3}
 
-_RENDER = ("merge", "mix", "layers")
-_TOP: tuple[str, ...] = (
-    "scene",
-    "reference",
-    "parameters",
-    "loss",
-    "delta",
-    "method",
-    "steps",
-    "tolerance",
-    "seed",
-    "restarts",
-)
-_TOP += ("learning_rate", "device", "checkpoint_seconds", "size", "resolve", *_RENDER)
-_MOST_PIXELS, _MOST_STEPS = 65536, 10**9
-_P = re.compile(r"\s*([0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)\s*P\s*")
+RENDER_OPTIONS = ("merge", "mix", "layers")
 
 
 class StudyError(ValueError):
@@ -96,40 +64,70 @@ class Reference:
 
 
 @dataclass(frozen=True, eq=False)
-class Study:
-    """What is fitted to which image, and how.
+class View:
+    """A camera of a study, and the image to approach from there.
 
     Attributes:
-        scene: the scene, as it is to be rendered (its camera's size is the size of the images).
-        reference: the image to approach.
+        camera: where from, and the size of the image.
+        reference: the image to approach; None takes the study's reference, rendered from this camera.
+        name: of the folder that this view's images are saved in: letters, digits, "_" and "-".
+        held_out: whether it is only rendered and compared at the end, and not fitted.
+    """
+
+    camera: Camera
+    reference: Reference | None = None
+    name: str = "view"
+    held_out: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """What is fitted to which images, and how.
+
+    Attributes:
+        scene: the scene, as it is to be rendered.
+        reference: the image to approach; with several views what they have in common, None where each has its own.
         parameters: what to fit: for each name a number to start from, or a `FitParameter`.
-        loss: "l2" (mean square), "l1" (mean absolute value, rounded off below 1e-3) or "huber" (square up to `delta`).
+        views: cameras and their references; empty for the scene's camera alone.
+        loss: "l2" (mean square), "l1" (mean absolute value, rounded off below 1e-3), "huber" (square up to `delta`) or
+            "ssim" (1 − structural similarity); or several with weights, such as {"l1": 0.8, "ssim": 0.2}.
         delta: where Huber's loss becomes linear [linear light].
-        method: "least_squares", "adam" or "lbfgs"; None takes least squares when every parameter is one value per
-            object, else Adam.
+        scales: levels of the image pyramid that the loss is the mean over, each of half the size of the one before.
+        method: "least_squares", "adam" or "lbfgs"; None takes least squares when every parameter is few values per
+            object and the loss is one it can take, else Adam.
         steps: most evaluations (least squares) or iterations (the others); None takes 100, 300 and 100.
         tolerance: stop when loss or parameters change relatively less than this.
-        seed: of the random starts.
-        restarts: further starts of least squares, drawn between the bounds; the best end counts.
+        patience: early stopping: Adam ends when the best loss of so many steps is not better, L-BFGS when so many steps
+            in a row changed nothing, both relatively by more than `tolerance`; None takes 50 and 3.
+        batch: views that Adam looks at in each step, drawn anew until all have had their turn; None takes all.
+        seed: of the random starts, and of the order of the views.
+        restarts: further starts, drawn at random between the bounds; the best end counts.
         learning_rate: Adam's step: beta, opacity and colour as they are, relative for a thickness.
         device: where torch and Warp compute.
         checkpoint_seconds: time between two checkpoints.
         resolve: how fragments become layers, in the reference as well: "sorted", or "kbuffer", as they come, into as
             many slots as the scene has layers (then beta plays no part).
         name: names the default output folder.
+        variables: the parameters, resolved against the scene (not given).
+        fitted_scene: the scene, with thicknesses that are fitted in multiples of P(z) in that unit (not given).
+        all_views: the views with their references, the scene's camera where no views are given (not given).
 
     Raises:
         StudyError: something of it does not exist, or is out of its range.
     """
 
     scene: Scene
-    reference: Reference
+    reference: Reference | None
     parameters: Mapping[str, FitParameter]
-    loss: Loss = "l2"
+    views: Sequence[View] = ()
+    loss: str | Mapping[str, float] = "l2"
     delta: float = 0.1
+    scales: int = 1
     method: Method | None = None
     steps: int | None = None
     tolerance: float = 1e-8
+    patience: int | None = None
+    batch: int | None = None
     seed: int = 0
     restarts: int = 0
     learning_rate: float = 0.02
@@ -138,43 +136,85 @@ class Study:
     resolve: Resolve = "sorted"
     name: str = "study"
     variables: tuple[Variable, ...] = field(init=False, repr=False)
+    fitted_scene: Scene = field(init=False, repr=False)
+    all_views: tuple[View, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
+        self._check_options()
         given = {
             name: value if isinstance(value, FitParameter) else FitParameter(value)
             for name, value in self.parameters.items()
         }
-        object.__setattr__(self, "parameters", given)
         if not given:
             raise StudyError("parameters: found none, expected at least one to fit")
         try:
-            object.__setattr__(self, "variables", resolve_parameters(self.scene, given))
-            self._check_reference()
+            object.__setattr__(self, "parameters", given)
+            starts = {name: parameter.start for name, parameter in given.items()}
+            scene, starts = in_multiples_of_p(self.scene, starts, "parameters")
+            object.__setattr__(self, "fitted_scene", scene)
+            self._complete_views()
+            cameras = [view.camera for view in self.fitted_views]
+            numeric = {name: replace(parameter, start=starts[name]) for name, parameter in given.items()}
+            object.__setattr__(self, "variables", resolve_parameters(scene, cameras, numeric))
+            for view in self.all_views:
+                _check_reference(view, self.scene, len(cameras))
         except StudyError:
             raise
         except (ValueError, TypeError) as error:
             raise StudyError(str(error)) from error
-        for key, choices in (
-            ("loss", get_args(Loss)),
-            ("method", (*get_args(Method), None)),
-            ("resolve", get_args(Resolve)),
-        ):
+        self._check_held_out()
+        self._choose_method()
+        if self.resolve == "kbuffer":
+            self._check_kbuffer()
+
+    @property
+    def fitted_views(self) -> list[View]:
+        """The views that are fitted, those that are not held out."""
+        return [view for view in self.all_views if not view.held_out]
+
+    @property
+    def is_global(self) -> bool:
+        """Whether every parameter is few values, for a whole object, scene or view."""
+        return all(variable.is_global for variable in self.variables)
+
+    @property
+    def image_loss(self) -> ImageLoss:
+        """The loss of one view's image."""
+        return ImageLoss.of(self.loss, self.delta, self.scales)
+
+    @property
+    def true(self) -> dict[str, np.ndarray] | None:
+        """The values that made the references, of the fitted parameters; None where they are not known."""
+        reference = self.reference
+        if reference is None or reference.true is None or any(v.reference is not reference for v in self.all_views):
+            return None
+        result = {}
+        scene, true = in_multiples_of_p(self.scene, reference.true, "reference.true")
+        for variable in self.variables:
+            name = variable.name
+            value = true.get(name, scene_value(scene, name))
+            other = variable.key == "thickness" and thickness_units(scene, name) != thickness_units(
+                self.fitted_scene, name
+            )
+            if value is None or other:
+                return None
+            result[name] = np.asarray(value, dtype=np.float64)
+        return result
+
+    def resized(self, size: tuple[int, int]) -> "Study":
+        """Return this study with another image size (width, height)."""
+        views = [replace(view, camera=view.camera.resized(size)) for view in self.views]
+        return replace(self, scene=replace(self.scene, camera=self.scene.camera.resized(size)), views=views)
+
+    def _check_options(self) -> None:
+        for key, choices in (("method", (*get_args(Method), None)), ("resolve", get_args(Resolve))):
             if getattr(self, key) not in choices:
                 expected = ", ".join(f'"{choice}"' for choice in choices if choice)
                 raise StudyError(f"{key}: found {shorten(getattr(self, key))}, expected one of {expected}")
-        if self.method is None:
-            object.__setattr__(self, "method", "least_squares" if self.is_global else "adam")
-        if self.method == "least_squares" and not self.is_global:
-            other = next(v.name for v in self.variables if not v.is_global)
-            expected = '"adam" or "lbfgs" (least squares fits one value per object)'
-            raise StudyError(f'method: found "least_squares" for {other}, expected {expected}')
-        if self.resolve == "kbuffer":
-            self._check_kbuffer()
-        if self.steps is None:
-            object.__setattr__(self, "steps", DEFAULT_STEPS[str(self.method)])
-        for key, least in (("steps", 1), ("seed", 0), ("restarts", 0)):
+        for key, least in (("steps", 1), ("seed", 0), ("restarts", 0), ("scales", 1), ("patience", 1), ("batch", 1)):
             value = getattr(self, key)
-            if isinstance(value, bool) or not isinstance(value, int) or value < least:
+            optional = value is None and key in ("steps", "patience", "batch")
+            if not optional and (isinstance(value, bool) or not isinstance(value, int) or value < least):
                 raise StudyError(f"{key}: found {shorten(value)}, expected a whole number from {least}")
         for key, strict in (
             ("delta", True),
@@ -185,25 +225,54 @@ class Study:
             value = getattr(self, key)
             if not is_number(value) or value < 0 or (strict and value == 0):
                 raise StudyError(f"{key}: found {shorten(value)}, expected a number {'above' if strict else 'from'} 0")
-        if self.restarts and self.method != "least_squares":
-            raise StudyError(f'restarts: found {self.restarts} with method "{self.method}", expected "least_squares"')
+        try:
+            ImageLoss.of(self.loss, self.delta, self.scales)
+        except ValueError as error:
+            raise StudyError(str(error)) from None
 
-    @property
-    def is_global(self) -> bool:
-        """Whether every parameter is one value for a whole object or scene."""
-        return all(variable.is_global for variable in self.variables)
+    def _complete_views(self) -> None:
+        """Give every view a reference with numbers only, and check that they can be told apart."""
+        views = tuple(self.views) or (View(self.scene.camera),)
+        views = tuple(replace(view, reference=view.reference or self.reference) for view in views)
+        object.__setattr__(self, "all_views", views)
+        names = [view.name for view in views]
+        for name in names:
+            if not isinstance(name, str) or not re.fullmatch(r"[\w-]+", name):
+                raise StudyError(f'views: found the name {shorten(name)}, expected letters, digits, "_" and "-"')
+            if names.count(name) > 1:
+                raise StudyError(f'views: found the name "{name}" more than once, expected unique names')
+        if not self.fitted_views:
+            raise StudyError("views: found all of them held out, expected one to fit")
+        if self.batch is not None and self.batch > len(self.fitted_views):
+            raise StudyError(f"batch: found {self.batch}, expected up to {len(self.fitted_views)}, the views to fit")
 
-    @property
-    def true(self) -> dict[str, np.ndarray] | None:
-        """The values that made the reference, of the fitted parameters; None where they are not known."""
-        if self.reference.true is None:
-            return None
-        known = {**self.scene.parameters(), **self.reference.true}
-        return {variable.name: np.asarray(known[variable.name], dtype=np.float64) for variable in self.variables}
+    def _check_held_out(self) -> None:
+        if len(self.fitted_views) == len(self.all_views):
+            return
+        for variable in self.variables:
+            if variable.per in ("pixel", "view"):
+                raise StudyError(
+                    f'parameters.{variable.name}: found per "{variable.per}" with views that are held out, for which '
+                    "there would be no value; expected one that all views share"
+                )
 
-    def resized(self, size: tuple[int, int]) -> "Study":
-        """Return this study with another image size (width, height)."""
-        return replace(self, scene=replace(self.scene, camera=self.scene.camera.resized(size)))
+    def _choose_method(self) -> None:
+        robust = self.image_loss.robust is not None
+        if self.method is None:
+            chosen = "least_squares" if self.is_global and robust and self.batch is None else "adam"
+            object.__setattr__(self, "method", chosen)
+        method = str(self.method)
+        if method == "least_squares" and not self.is_global:
+            other = next(v.name for v in self.variables if not v.is_global)
+            expected = '"adam" or "lbfgs" (least squares fits few values per object)'
+            raise StudyError(f'method: found "least_squares" for {other}, expected {expected}')
+        if method == "least_squares" and not robust:
+            raise StudyError(f'loss: found {shorten(self.loss)} with "least_squares", expected "l2", "l1" or "huber"')
+        if self.batch is not None and method != "adam":
+            raise StudyError(f'batch: found {self.batch} with method "{method}", expected "adam"')
+        for key, defaults in (("steps", DEFAULT_STEPS), ("patience", DEFAULT_PATIENCE)):
+            if getattr(self, key) is None:
+                object.__setattr__(self, key, defaults[method])
 
     def _check_kbuffer(self) -> None:
         scene = self.scene
@@ -214,166 +283,42 @@ class Study:
         if "beta" in self.parameters:
             raise StudyError('parameters: found beta with resolve "kbuffer", in which it plays no part')
 
-    def _check_reference(self) -> None:
-        reference = self.reference
-        if (reference.image is None) == (reference.true is None):
-            found = "neither" if reference.image is None else "both"
-            raise StudyError(f"reference: found {found} of image and true, expected one of them")
-        if reference.true is not None:
-            known = self.scene.parameters()
-            for name in reference.true:
-                check_name(name, known, "reference.true")
-            beta = reference.true.get("beta", 0.0)
-            if not is_number(beta) or not 0.0 <= beta <= 1.0:
-                raise StudyError(f"reference.true.beta: found {shorten(beta)}, expected a number from 0 to 1")
-            assemble(self.scene, dict(reference.true))
-        elif reference.supersampling != 1 or any(getattr(reference, key) is not None for key in _RENDER):
-            raise StudyError("reference: found options of a render with an image, expected them with true")
-        samples = reference.supersampling
-        if isinstance(samples, bool) or not isinstance(samples, int) or not 1 <= samples <= 64:
-            raise StudyError(f"reference.supersampling: found {shorten(samples)}, expected a whole number from 1 to 64")
+
+def _check_reference(view: View, scene: Scene, count: int) -> None:
+    reference = view.reference
+    if reference is None:
+        raise StudyError(f'reference: found none for the view "{view.name}", expected an image or true')
+    if (reference.image is None) == (reference.true is None):
+        found = "neither" if reference.image is None else "both"
+        raise StudyError(f"reference: found {found} of image and true, expected one of them")
+    if reference.true is not None:
+        for name in reference.true:
+            check_name(name, scene, "reference.true")
+        scene, true = in_multiples_of_p(scene, true_of_view(reference, 0, count), "reference.true")
+        assemble(scene, true, camera=view.camera)
+        _check_beta(reference.true.get("beta", 0.0), view.camera, count)
+    elif reference.supersampling != 1 or any(getattr(reference, key) is not None for key in RENDER_OPTIONS):
+        raise StudyError("reference: found options of a render with an image, expected them with true")
+    samples = reference.supersampling
+    if isinstance(samples, bool) or not isinstance(samples, int) or not 1 <= samples <= 64:
+        raise StudyError(f"reference.supersampling: found {shorten(samples)}, expected a whole number from 1 to 64")
 
 
-def load_study(path: str | os.PathLike, *, size: tuple[int, int] | None = None) -> Study:
-    """Read a study file, the scene it names and its reference image.
-
-    Args:
-        path: a TOML file.
-        size: width and height in place of those in the files.
-
-    Raises:
-        StudyError: anything in it that cannot be used: file, key, what was found, what is expected.
-        SceneError: the same about the scene file.
-        ImageError: the reference image cannot be read.
-
-    Example:
-        >>> load_study("scenes/studies/bunny_in_sphere.toml").method
-        'least_squares'
-    """
-    path = Path(path)
-    try:
-        data = read_toml(path)
-        top = Table(data, path, "", _TOP)
-        scene = _scene(top, path, size)
-        values: dict[str, Any] = {
-            key: top.choice(key, get_args(kind))
-            for key, kind in (("loss", Loss), ("method", Method), ("resolve", Resolve))
-        }
-        values["steps"] = top.integer("steps", 1, _MOST_STEPS)
-        values["seed"] = top.integer("seed", 0, 2**63 - 1)
-        values["restarts"] = top.integer("restarts", 0, _MOST_STEPS)
-        values["delta"] = top.number("delta", above=0.0)
-        values["tolerance"] = top.number("tolerance", 0.0)
-        values["learning_rate"] = top.number("learning_rate", above=0.0)
-        values["checkpoint_seconds"] = top.number("checkpoint_seconds", 0.0)
-        values["device"] = top.text("device")
-        reference = _reference(top, path, scene)
-        parameters = _parameters(top, scene)
-    except ImageError:
-        raise
-    except SceneError as error:
-        # What a scene file did wrong keeps its own class.
-        raise error if not str(error).startswith(str(path)) else StudyError(str(error)) from None
-    try:
-        given = {key: value for key, value in values.items() if value is not None}
-        return Study(scene, reference, parameters, name=path.stem, **given)
-    except StudyError as error:
-        raise StudyError(f"{path}: {error}") from None
+def _check_beta(value: Any, camera: Camera, count: int) -> None:
+    beta = np.asarray(value, dtype=np.float64)
+    shapes = ((), camera.shape, (count, *camera.shape))
+    if beta.shape not in shapes or not (np.isfinite(beta) & (beta >= 0.0) & (beta <= 1.0)).all():
+        found = shorten(value) if beta.ndim == 0 else f"an array of shape {beta.shape}"
+        raise StudyError(f"reference.true.beta: found {found}, expected numbers from 0 to 1, one or a map")
 
 
-def _scene(top: Table, path: Path, size: tuple[int, int] | None) -> Scene:
-    name = top.text("scene")
-    if name is None:
-        raise top.error("scene", "none", "the path of a scene file, relative to the study's folder")
-    file = path.parent / name
-    if not file.is_file():
-        raise top.error("scene", f"no such file at {file}", "a scene file")
-    scene = load_scene(file)
-    if "size" in top:
-        value = top.data["size"]
-        whole = isinstance(value, list) and len(value) == 2 and all(type(part) is int for part in value)
-        if not whole or not 1 <= min(value) <= max(value) <= _MOST_PIXELS:
-            raise top.error("size", shorten(value), f"width and height, two whole numbers from 1 to {_MOST_PIXELS}")
-        size = size or (value[0], value[1])
-    if size is not None:
-        scene = replace(scene, camera=scene.camera.resized(size))
-    overrides = {key: value for key, value in _render_options(top).items() if value is not None}
-    return replace(scene, **overrides)
-
-
-def _render_options(table: Table) -> dict[str, Any]:
-    return {
-        "merge": table.choice("merge", MERGES),
-        "mix": table.choice("mix", MIXES),
-        "layers": table.integer("layers", 1, 2**31 - 1),
-    }
-
-
-def _reference(top: Table, path: Path, scene: Scene) -> Reference:
-    table = top.table("reference", ("image", "true", "supersampling", *_RENDER))
-    if table is None:
-        raise top.error("reference", "none", "a table [reference] with image or true")
-    if ("image" in table) == ("true" in table):
-        found = "both image and true" if "image" in table else "neither image nor true"
-        raise table.error("", found, "one of them")
-    options = _render_options(table)
-    options["supersampling"] = table.integer("supersampling", 1, 64)
-    options = {key: value for key, value in options.items() if value is not None}
-    if "image" in table:
-        if options:
-            raise table.error(next(iter(options)), "it with an image", "it with true (it belongs to a render)")
-        file = path.parent / str(table.text("image"))
-        return Reference(read_image(file), source=str(file))
-    true = table.data["true"]
-    if not isinstance(true, dict):
-        raise table.error("true", shorten(true), "a table of parameter names and values")
-    true = flatten_names(true, scene)
-    return Reference(true={name: _value(table, f"true.{name}", name, true[name], scene) for name in true}, **options)
-
-
-def _parameters(top: Table, scene: Scene) -> dict[str, FitParameter]:
-    table = top.data.get("parameters")
-    if not isinstance(table, dict) or not table:
-        found = "none" if not table else shorten(table)
-        raise top.error("parameters", found, "a table [parameters] of names and start values")
+def true_of_view(reference: Reference, index: int, count: int) -> dict[str, Any]:
+    """Return a reference's values for one of `count` fitted views: its part of what is stacked by view."""
     result = {}
-    for name, given in flatten_names(table, scene).items():
-        if name not in scene.parameters():
-            try:
-                check_name(name, scene.parameters(), "parameters")
-            except ValueError as error:
-                raise SceneError(f"{top.file}: {error}") from None
-        if not isinstance(given, dict):
-            given = {"start": given}
-        entry = Table(given, top.file, f"parameters.{name}", ("start", "lower", "upper", "per", "learning_rate"))
-        start = None if "start" not in entry else _value(entry, "start", name, given["start"], scene)
-        lower, upper = entry.number("lower"), entry.number("upper")
-        per: Any = entry.choice("per", PER)
-        result[name] = FitParameter(start, lower, upper, per, entry.number("learning_rate", above=0.0))
+    for name, value in (reference.true or {}).items():
+        array = np.asarray(value)
+        is_map = name.endswith(("thickness", "beta")) and array.ndim == 3
+        is_pose = name.startswith("camera.") and array.ndim == 2
+        stacked = (is_map or is_pose) and len(array) == count
+        result[name] = array[index] if stacked else value
     return result
-
-
-def _value(table: Table, key: str, name: str, value: Any, scene: Scene) -> Any:
-    """Return a value from a file: a number, numbers, a colour "#rrggbb", or a thickness "2P"."""
-    kind = name.rpartition(".")[2]
-    if isinstance(value, str):
-        color = parse_hex(value) if kind == "color" else None
-        if color is not None:
-            return list(color[:3])
-        match = _P.fullmatch(value) if kind == "thickness" and name in scene.parameters() else None
-        if match is not None and find_object(scene, name).thickness_unit == "P":
-            return float(match[1])
-        if match is not None:
-            raise table.error(key, shorten(value), "a number, as the scene gives this thickness in scene units")
-    if is_number(value) and kind != "color":
-        return float(value)
-    if isinstance(value, list) and _is_numeric(value):
-        return np.asarray(value, dtype=np.float64)
-    expected = '3 numbers or "#rrggbb"' if kind == "color" else "a number"
-    raise table.error(key, shorten(value), expected)
-
-
-def _is_numeric(value: list) -> bool:
-    if all(isinstance(part, list) for part in value):
-        return bool(value) and len({len(part) for part in value}) == 1 and all(is_numbers(p, len(p)) for p in value)
-    return is_numbers(value, len(value)) and math.prod((len(value),)) > 0

@@ -39,7 +39,7 @@ from warpfrag.scene.points import load_points, surfels
 from warpfrag.scene.table import Table, is_number, is_numbers, number_words, read_toml
 
 _TOP = ("beta", "layers", "merge", "mix", "background", "camera", "light", "object")
-_CAMERA = ("eye", "target", "up", "fov", "height", "near", "far", "size")
+CAMERA_KEYS = ("eye", "target", "up", "fov", "height", "near", "far", "size")
 _PLACE = ("translate", "rotate", "scale")
 _OBJECT = ("name", *_PLACE, "matrix", "color", "opacity", "thickness", "texture", "normals")
 _PRIMITIVES = {
@@ -104,12 +104,25 @@ def load_scene(path: str | os.PathLike) -> Scene:
 
 
 def _camera(top: Table) -> Camera:
-    table = top.table("camera", _CAMERA)
+    table = top.table("camera", CAMERA_KEYS)
     if table is None:
         raise top.error("camera", "none", "a table [camera] with eye, target and fov or height")
     for key in ("eye", "target"):
         if key not in table:
             raise table.error(key, "none", "3 numbers")
+    return read_camera(table)
+
+
+def read_camera(table: Table, base: Camera | None = None) -> Camera:
+    """Read a camera from the keys of a table.
+
+    Args:
+        table: A table with some of ``CAMERA_KEYS``.
+        base: The camera whose values stand for those that the table does not give; None takes the defaults.
+
+    Raises:
+        SceneError: A value of the wrong type or out of its range.
+    """
     values: dict[str, Any] = {key: table.numbers(key, 3, "3 numbers") for key in ("eye", "target", "up")}
     values.update({key: table.number(key) for key in ("fov", "height", "near", "far")})
     if "size" in table:
@@ -118,10 +131,15 @@ def _camera(top: Table) -> Camera:
         if not whole or not 1 <= min(size) <= max(size) <= _PIXELS:
             raise table.error("size", shorten(size), f"width and height, two whole numbers from 1 to {_PIXELS}")
         values["size"] = tuple(size)
+    values = {key: value for key, value in values.items() if value is not None}
+    # One of the two kinds of camera takes the place of the other.
+    for key, other in (("fov", "height"), ("height", "fov")):
+        if base is not None and key in values and other not in values:
+            values[other] = None
     try:
-        return Camera(**{key: value for key, value in values.items() if value is not None})
+        return Camera(**values) if base is None else replace(base, **values)
     except ValueError as error:
-        raise top.wrap("", error) from None
+        raise SceneError(f"{table.file}: {' '.join(str(error).split())}") from None
 
 
 def _object(

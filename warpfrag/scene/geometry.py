@@ -1,8 +1,10 @@
 """A scene as flat arrays, ready for capture, with parameters put in the place of the scene's own values.
 
-Differentiable, with torch overrides: world vertices in ``"<name>.vertices"``, colour, opacity and thickness in theirs.
-Frozen: faces, transforms, textures and the baked Lambert factors (they stay those of the loaded mesh when vertices
-move).
+Differentiable, with torch overrides: world vertices in ``"<name>.vertices"``, ``"<name>.translation"`` and
+``"<name>.rotation"``, colour, opacity and thickness in theirs. Frozen: faces, transforms, the point about which an
+object turns, textures and the baked Lambert factors (they stay those of the loaded mesh when vertices, objects or the
+camera move). What captures the geometry holds coverage fixed as well: a gradient in vertices or poses moves depths and
+attributes inside outlines, not the outlines.
 """
 
 import sys
@@ -14,7 +16,15 @@ import numpy as np
 
 from warpfrag.scene.camera import Camera
 from warpfrag.scene.errors import shorten, suggest
-from warpfrag.scene.objects import PARAMETER_KEYS, Scene, SceneObject, check_parameter
+from warpfrag.scene.objects import (
+    PARAMETER_KEYS,
+    Scene,
+    SceneObject,
+    check_common_thickness,
+    check_parameter,
+    check_pose,
+)
+from warpfrag.scene.pose import POSE_KEYS, move_object
 
 
 @dataclass(frozen=True)
@@ -35,6 +45,8 @@ class Geometry:
         textures: Straight linear RGBA images (h, w, 4) float32 NumPy, row 0 at the top, multiplied with ``rgba``.
         thickness_maps: z-thickness per pixel (H, W), by object index, for the objects that have a map.
         thickness_in_p: Whether the thickness of each object is in multiples of P(z), (objects,) bool NumPy.
+        camera_pose: How the camera is moved: translation [scene units] and rotation vector [degrees] in its own axes,
+            (3,) each; None where it stays.
     """
 
     vertices: Any
@@ -48,6 +60,7 @@ class Geometry:
     textures: list[np.ndarray]
     thickness_maps: dict[int, Any]
     thickness_in_p: np.ndarray
+    camera_pose: tuple[Any, Any] | None = None
 
 
 def assemble(scene: Scene, parameters: Mapping[str, Any] | None = None, *, camera: Camera | None = None) -> Geometry:
@@ -56,7 +69,8 @@ def assemble(scene: Scene, parameters: Mapping[str, Any] | None = None, *, camer
     Args:
         scene: What to flatten.
         parameters: Values by the names of ``scene.parameters()``: numbers, NumPy arrays or torch tensors. A thickness
-            is in the object's own unit; it may be one number, one per vertex, or an (H, W) map. ``"beta"`` is let
+            is in the object's own unit; it may be one number, one per vertex, or an (H, W) map. ``"thickness"`` without
+            a name, one number or a map, is that of all objects without one of their own here. ``"beta"`` is let
             through.
         camera: Whose pixel grid thickness maps must have; default the scene's.
 
@@ -75,6 +89,9 @@ def assemble(scene: Scene, parameters: Mapping[str, Any] | None = None, *, camer
     camera = camera or scene.camera
     overrides = _checked(scene, parameters or {})
     kind = _ArrayKind(overrides)
+    overrides = {name: kind.array(value) for name, value in overrides.items()}
+    if "thickness" in overrides:
+        check_common_thickness(overrides["thickness"], camera)
     vertices, rgba, thickness, faces, uv, texture_id = [], [], [], [], [], []
     textures: list[np.ndarray] = []
     thickness_maps: dict[int, Any] = {}
@@ -83,11 +100,14 @@ def assemble(scene: Scene, parameters: Mapping[str, Any] | None = None, *, camer
     for index, item in enumerate(scene.objects):
         values = {}
         for key in PARAMETER_KEYS:
-            values[key] = kind.array(overrides.get(f"{item.name}.{key}", getattr(item, key)))
+            own = overrides.get("thickness", item.thickness) if key == "thickness" else getattr(item, key)
+            values[key] = kind.array(overrides.get(f"{item.name}.{key}", own))
             check_parameter(item, key, values[key], camera)
         count = len(item.vertices)
         rotation, shift = kind.array(item.matrix[:3, :3].T.copy()), kind.array(item.matrix[:3, 3].copy())
-        vertices.append(kind.xp.matmul(values["vertices"], rotation) + shift)
+        world = kind.xp.matmul(values["vertices"], rotation) + shift
+        pose = _pose(item.name, overrides, kind)
+        vertices.append(world if pose is None else move_object(world, item.middle(), *pose))
         color = kind.xp.broadcast_to(values["color"], (count, 3))
         if item.shade is not None:
             color = color * kind.array(item.shade)[:, None]
@@ -116,6 +136,7 @@ def assemble(scene: Scene, parameters: Mapping[str, Any] | None = None, *, camer
         textures=textures,
         thickness_maps=thickness_maps,
         thickness_in_p=np.array([item.thickness_unit == "P" for item in scene.objects], dtype=bool),
+        camera_pose=_pose("camera", overrides, kind),
     )
 
 
@@ -154,6 +175,18 @@ def _is_map(item: SceneObject, thickness: Any) -> bool:
     return len(thickness.shape) == 2
 
 
+def _pose(owner: str, overrides: Mapping[str, Any], kind: _ArrayKind) -> tuple[Any, Any] | None:
+    """Return the translation and rotation that overrides give an object or the camera, None without."""
+    names = [f"{owner}.{key}" for key in POSE_KEYS]
+    if not any(name in overrides for name in names):
+        return None
+    for name in names:
+        if name in overrides:
+            check_pose(name, overrides[name])
+    translation, rotation = (overrides.get(name, kind.array(np.zeros(3))) for name in names)
+    return translation, rotation
+
+
 def _texture_ids(item: SceneObject, first: int) -> np.ndarray:
     if item.texture is None:
         return np.full(len(item.faces), -1, dtype=np.int32)
@@ -165,7 +198,8 @@ def _texture_ids(item: SceneObject, first: int) -> np.ndarray:
 def _checked(scene: Scene, parameters: Mapping[str, Any]) -> dict[str, Any]:
     if not isinstance(parameters, Mapping):
         raise TypeError(f"parameters: found {type(parameters).__name__}, expected a mapping from names to values")
-    known = {"beta", *(f"{item.name}.{key}" for item in scene.objects for key in PARAMETER_KEYS)}
+    names = [f"{item.name}.{key}" for item in scene.objects for key in (*PARAMETER_KEYS, *POSE_KEYS)]
+    known = {"beta", "thickness", *names, *(f"camera.{key}" for key in POSE_KEYS)}
     checked = {}
     for name, value in parameters.items():
         if name not in known:

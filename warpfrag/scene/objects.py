@@ -10,6 +10,7 @@ import numpy as np
 
 from warpfrag.scene.camera import Camera
 from warpfrag.scene.errors import shorten
+from warpfrag.scene.pose import POSE_KEYS
 
 PARAMETER_KEYS = ("thickness", "color", "opacity", "vertices")
 MERGES = ("none", "smooth", "order_independent", "exact")
@@ -97,6 +98,13 @@ class SceneObject:
         """Return the vertices in world space [scene units], (V, 3) float64."""
         return self.vertices.astype(np.float64) @ self.matrix[:3, :3].T + self.matrix[:3, 3]
 
+    def middle(self) -> np.ndarray:
+        """Return the middle of the bounding box in world space [scene units], (3,) float64."""
+        if not len(self.vertices):
+            return self.matrix[:3, 3].copy()
+        world = self.world_vertices()
+        return 0.5 * (world.min(axis=0) + world.max(axis=0))
+
     def _check_texture(self) -> None:
         if self.uv is not None:
             self.uv = self._array("uv", self.uv).astype(np.float32)
@@ -137,7 +145,7 @@ class Scene:
 
     Attributes:
         camera: The view.
-        objects: In submission order; their names are unique.
+        objects: In submission order; their names are unique, and none is "camera".
         background: Premultiplied linear RGBA behind everything, 4 numbers.
         beta: In-slab interpolation, 0…1.
         layers: Largest number of layers of a pixel, from 1.
@@ -145,7 +153,7 @@ class Scene:
         mix: How their colours are weighted.
 
     Raises:
-        ValueError: Two objects of one name, or a value out of its range.
+        ValueError: Two objects of one name, one named "camera", or a value out of its range.
     """
 
     camera: Camera
@@ -161,6 +169,10 @@ class Scene:
         repeated = [name for name, count in Counter(item.name for item in self.objects).items() if count > 1]
         if repeated:
             raise ValueError(f'objects: found the name "{repeated[0]}" more than once, expected unique names')
+        if any(item.name == "camera" for item in self.objects):
+            raise ValueError(
+                'objects: found the name "camera", expected another (the camera\'s own parameters have it)'
+            )
         background = np.asarray(self.background, dtype=np.float64)
         if background.shape != (4,) or not np.isfinite(background).all() or background.min() < 0 or background[3] > 1:
             found = shorten(self.background)
@@ -181,13 +193,16 @@ class Scene:
         """Return what can be overridden, fitted or differentiated, by name.
 
         Returns:
-            ``"beta"``, and for each object ``"<name>.thickness"`` (in the object's own ``thickness_unit``),
-            ``".color"``, ``".opacity"`` and ``".vertices"`` (its own space): floats and copies of arrays, safe to
-            change.
+            Floats and copies of arrays, safe to change: ``"beta"``; for each object ``"<name>.thickness"`` (in the
+            object's own ``thickness_unit``), ``".color"``, ``".opacity"`` and ``".vertices"`` (its own space); and as
+            zeros ``"<name>.translation"`` [scene units] and ``"<name>.rotation"`` (rotation vector [degrees], about the
+            middle of the bounding box of the object as it stands), along the world's axes, and
+            ``"camera.translation"`` and ``"camera.rotation"`` (about the eye), along the camera's: right, down,
+            forward.
 
         Example:
-            >>> sorted(scene.parameters())
-            ['ball.color', 'ball.opacity', 'ball.thickness', 'ball.vertices', 'beta']
+            >>> sorted(scene.parameters())[:4]
+            ['ball.color', 'ball.opacity', 'ball.rotation', 'ball.thickness']
         """
         result: dict[str, float | np.ndarray] = {"beta": float(self.beta)}
         for item in self.objects:
@@ -196,6 +211,8 @@ class Scene:
                 result[f"{item.name}.{key}"] = (
                     float(value) if np.ndim(value) == 0 else np.array(value, dtype=np.float32)
                 )
+        for owner in (*(item.name for item in self.objects), "camera"):
+            result.update({f"{owner}.{key}": np.zeros(3, dtype=np.float32) for key in POSE_KEYS})
         return result
 
 
@@ -229,14 +246,37 @@ def check_parameter(item: SceneObject, key: str, value: Any, camera: Camera | No
         grid = "(H, W)" if camera is None else str(camera.shape)
         allowed = shape in ((), (count,)) or (len(shape) == 2 if camera is None else shape == camera.shape)
         words = f"(), ({count},) or a map of shape {grid}"
-    name = f"{item.name}.{key}"
+    span = {"opacity": "from 0 to 1", "vertices": "that are finite"}.get(key, "from 0, finite")
+    _check_value(f"{item.name}.{key}", value, allowed, words, (low, high), span)
+
+
+def check_pose(name: str, value: Any) -> None:
+    """Check shape and finiteness of a translation or rotation, a NumPy array or torch tensor.
+
+    Raises:
+        ValueError: With the parameter's name, what was found and what is expected.
+    """
+    _check_value(name, value, tuple(value.shape) == (3,), "(3,)", (-math.inf, math.inf), "that are finite")
+
+
+def check_common_thickness(value: Any, camera: Camera) -> None:
+    """Check a thickness for all objects, a NumPy array or torch tensor: one number, or a map of the camera's pixels.
+
+    Raises:
+        ValueError: With the parameter's name, what was found and what is expected.
+    """
+    allowed = tuple(value.shape) in ((), camera.shape)
+    _check_value("thickness", value, allowed, f"() or a map of shape {camera.shape}", (0.0, math.inf), "from 0, finite")
+
+
+def _check_value(name: str, value: Any, allowed: bool, words: str, limits: tuple[float, float], span: str) -> None:
+    """Raise unless a parameter has an allowed shape and finite values within limits, which `span` words."""
     if not allowed:
-        raise ValueError(f"{name}: found shape {shape}, expected shape {words}")
+        raise ValueError(f"{name}: found shape {tuple(value.shape)}, expected shape {words}")
     if isinstance(value, np.ndarray):
         isfinite = np.isfinite
     else:
         isfinite, value = sys.modules["torch"].isfinite, value.detach()
-    good = isfinite(value) & (value >= low) & (value <= high)
+    good = isfinite(value) & (value >= limits[0]) & (value <= limits[1])
     if not bool(good.all()):
-        span = {"opacity": "from 0 to 1", "vertices": "that are finite"}.get(key, "from 0, finite")
         raise ValueError(f"{name}: found {float(value[~good].reshape(-1)[0]):g}, expected numbers {span}")

@@ -1,0 +1,68 @@
+"""The fragments of a view as functions of few values per object.
+
+While only a thickness, an opacity or a colour per object change, coverage, depth and interpolated attributes stay: the
+scene is shaded with ones in place of the fitted values. A fragment's thickness is then that of the shading (1, or P(z))
+times the object's value, its premultiplied colour that of the shading times colour and opacity.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from warpfrag.capture.coverage import Coverage
+from warpfrag.fit.parameters import Variable
+from warpfrag.fragments import Fragments
+from warpfrag.scene.objects import Scene
+
+
+class UnitFragments:
+    """Fragments with ones in place of the fitted values.
+
+    Args:
+        scene: the scene.
+        coverage: what each pixel sees.
+        variables: the fitted parameters, all global.
+        moved: values of those that move something.
+    """
+
+    def __init__(
+        self, scene: Scene, coverage: Coverage, variables: Sequence[Variable], moved: Mapping[str, Any] | None = None
+    ) -> None:
+        ones = {v.name: np.ones(v.start.shape, np.float32) for v in variables if v.key != "beta" and not v.moves}
+        # What the fragments were shaded with.
+        self.parameters = {**ones, **(moved or {})}
+        self.fragments: Fragments = coverage.shade(self.parameters).numpy()
+        self.names = [item.name for item in scene.objects]
+        self.objects = np.asarray(self.fragments.object_id)
+
+    def owned(self, name: str, fitted: Sequence[Variable]) -> list[int]:
+        """Return the objects that a parameter is a value of.
+
+        Args:
+            name: the parameter.
+            fitted: all fitted parameters: a thickness of the scene is that of the objects without one of their own.
+        """
+        owner, _, key = name.rpartition(".")
+        own = {v.owner for v in fitted if v.key == key}
+        return [i for i, item in enumerate(self.names) if (item == owner if owner else item not in own)]
+
+    def scales(self, values: Mapping[str, Any], fitted: Sequence[Variable]) -> tuple[np.ndarray, np.ndarray]:
+        """Return the factors of each object's colours and opacity, (objects, 4), and thickness, (objects,)."""
+        rgba, thickness = np.ones((len(self.names), 4), np.float32), np.ones(len(self.names), np.float32)
+        for variable in fitted:
+            owned, value = self.owned(variable.name, fitted), values.get(variable.name)
+            if variable.key == "color":
+                rgba[owned, :3] *= value
+            elif variable.key == "opacity":
+                rgba[owned] *= value
+            elif variable.key == "thickness":
+                thickness[owned] = value
+        return rgba, thickness
+
+    def scaled(self, values: Mapping[str, Any], fitted: Sequence[Variable]) -> Fragments:
+        """Return the fragments for parameter values."""
+        rgba, thickness = self.scales(values, fitted)
+        unit = self.fragments
+        return replace(unit, rgba=unit.rgba * rgba[self.objects], thickness=unit.thickness * thickness[self.objects])
