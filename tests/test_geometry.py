@@ -74,8 +74,9 @@ def test_parameters_round_trip():
     """`parameters()` has every name, copies its arrays, and put back changes nothing."""
     scene = two_objects()
     parameters = scene.parameters()
-    keys = ("thickness", "color", "opacity", "vertices")
-    assert set(parameters) == {"beta", *(f"{name}.{key}" for name in ("tri", "square") for key in keys)}
+    keys = ("thickness", "color", "opacity", "vertices", "translation", "rotation")
+    names = {f"{name}.{key}" for name in ("tri", "square") for key in keys}
+    assert set(parameters) == {"beta", "camera.translation", "camera.rotation", *names}
     assert parameters["tri.opacity"] == 0.5
     same = assemble(scene, parameters)
     for name in ("vertices", "rgba", "thickness"):
@@ -110,6 +111,21 @@ def test_thickness_map():
         assemble(scene, large)
 
 
+def test_one_thickness_for_all_objects():
+    """`"thickness"` holds for every object without an own override, as a number or a map that is there once."""
+    scene = two_objects()
+    geometry = assemble(scene, {"thickness": 3.0})
+    np.testing.assert_array_equal(geometry.thickness, [3.0] * 7)
+    np.testing.assert_array_equal(geometry.thickness_in_p, [False, True])
+    geometry = assemble(scene, {"tri.thickness": 0.5, "thickness": 3.0})
+    np.testing.assert_array_equal(geometry.thickness, [0.5] * 3 + [3.0] * 4)
+    values = np.arange(12.0).reshape(3, 4)
+    maps = assemble(scene, {"thickness": values}).thickness_maps
+    assert maps[0] is maps[1]
+    np.testing.assert_array_equal(maps[0], values)
+    assert list(assemble(scene, {"tri.thickness": 0.5, "thickness": values}).thickness_maps) == [1]
+
+
 @pytest.mark.parametrize(
     ("overrides", "error", "words"),
     [
@@ -126,6 +142,17 @@ def test_thickness_map():
         ({"tri.vertices": SQUARE}, ValueError, r"tri.vertices: found shape \(4, 3\), expected shape \(3, 3\)"),
         ({"tri.vertices": TRIANGLE + np.inf}, ValueError, "tri.vertices: found inf"),
         ([("tri.color", 1)], TypeError, "expected a mapping"),
+        ({"tri.rotation": 1.0}, ValueError, r"tri.rotation: found shape \(\), expected shape \(3,\)"),
+        (
+            {"tri.translation": [0, np.nan, 0]},
+            ValueError,
+            "tri.translation: found nan, expected numbers that are finite",
+        ),
+        ({"camera.rotation": [1, 2]}, ValueError, r"camera.rotation: found shape \(2,\), expected shape \(3,\)"),
+        ({"camera.turn": [1, 2]}, ValueError, 'unknown name "camera.turn"'),
+        ({"thickness": [1, 2, 3]}, ValueError, r"thickness: found shape \(3,\), expected shape \(\) or a map of shape"),
+        ({"thickness": -1}, ValueError, "thickness: found -1, expected numbers from 0, finite"),
+        ({"thicknes": 1}, ValueError, 'unknown name "thicknes"; did you mean "thickness"?'),
     ],
 )
 def test_refused_overrides(overrides, error, words):
@@ -167,6 +194,8 @@ def test_refused_scenes(change):
     item = SceneObject("x", TRIANGLE, [[0, 1, 2]])
     with pytest.raises(ValueError, match='found the name "x" more than once'):
         Scene(CAMERA, [item, item])
+    with pytest.raises(ValueError, match='found the name "camera", expected another'):
+        Scene(CAMERA, [SceneObject("camera", TRIANGLE, [[0, 1, 2]])])
 
 
 def test_torch_overrides_keep_their_precision():

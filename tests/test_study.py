@@ -146,7 +146,7 @@ MISTAKES = [
     ("beta = 0.9", "ball.thicknes = 1", 'did you mean "ball.thickness"?'),
     ("start = 0.1, lower = 0.01", "start = 0.001, lower = 0.01", "start: found 0.001, expected from 0.01"),
     ("lower = 0.01", "lower = 0", "expected a number above 0 (its logarithm is fitted)"),
-    ("start = 0.1", "start = '5Q'", "start: found \"5Q\""),
+    ("start = 0.1", "start = '5Q'", 'start: found "5Q"'),
     ("start = 0.1", "start = 0.1, smoothness = 1", "found it with one value per object"),
     ("start = 0.1", "start = 0.1, levels = 2", "levels: found 2 with one value per object"),
     ("upper = 1.5", "per = 'vertex'", 'found "least_squares" for ball.thickness'),

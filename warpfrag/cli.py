@@ -135,8 +135,7 @@ def render(
 
     check_target(output, bits=bits)
     wanted = load_scene(scene)
-    for setting in settings or []:
-        wanted = _set(wanted, setting)
+    wanted = _set_all(wanted, settings or [])
     if thickness is not None:
         changed = [_with_thickness(item, "--thickness", thickness) for item in wanted.objects]
         wanted = replace(wanted, objects=changed)
@@ -153,7 +152,7 @@ def render(
 def fit(
     study: Annotated[
         Path | None,
-        typer.Argument(metavar="[STUDY]", help="A study file, or a folder with a study.py.", show_default=False),
+        typer.Argument(metavar="STUDY", help="A study file, or a folder with a study.py.", show_default=False),
     ] = None,
     every: Annotated[bool, typer.Option("--all", help="Run every study's folder and write one report.")] = False,
     source: Annotated[
@@ -195,6 +194,7 @@ def fit(
     _quiet()
     from warpfrag.fit import fit as fit_study
     from warpfrag.fit import load_study
+    from warpfrag.fit.processes import is_first_process
     from warpfrag.fit.session import CHECKPOINT
 
     wanted = load_study(study, size=None if size is None else _parse_size(size))
@@ -202,7 +202,8 @@ def fit(
         wanted = replace(wanted, steps=steps)
     folder = output if output is not None else Path("results") / wanted.name
     try:
-        with _logged(wanted.name, folder / "tensorboard" if tensorboard else None) as progress:
+        log = folder / "tensorboard" if tensorboard and is_first_process() else None
+        with _logged(wanted.name, log) as progress:
             result = fit_study(wanted, resume=resume, output=folder, progress=progress)
     except KeyboardInterrupt:
         if not (folder / CHECKPOINT).is_file():
@@ -210,9 +211,10 @@ def fit(
         again = f"warpfrag fit {study}" + (f" -o {output}" if output else "") + (f" --size {size}" if size else "")
         again += (f" --steps {steps}" if steps is not None else "") + (" --tensorboard" if tensorboard else "")
         raise typer.Exit(_complain(f"stopped; go on with: {again} --resume", 130)) from None
-    for line in result.lines():
-        print(line)
-    print(f"results in {folder}")
+    if is_first_process():
+        for line in result.lines():
+            print(line)
+        print(f"results in {folder}")
 
 
 @contextmanager
@@ -301,8 +303,7 @@ def inspect(
         raise UsageError(f"{target}: found the suffix {target.suffix or '(none)'}, expected .png")
     check_target(target)
     wanted = load_scene(scene)
-    for setting in settings or []:
-        wanted = _set(wanted, setting)
+    wanted = _set_all(wanted, settings or [])
     changes: dict[str, Any] = {"beta": beta, "layers": layers, "merge": merge, "mix": mix}
     changes = {key: value for key, value in changes.items() if value is not None}
     if size is not None:
@@ -352,10 +353,18 @@ def _with_thickness(item: "SceneObject", option: str, text: str) -> "SceneObject
     return replace(item, thickness=number, thickness_unit="scene")
 
 
+def _set_all(scene: "Scene", settings: Sequence[str]) -> "Scene":
+    """Return the scene with parameters set, rotations last: the camera's translation is along its axes in the file."""
+    for setting in sorted(settings, key=lambda each: each.partition("=")[0].strip().endswith(".rotation")):
+        scene = _set(scene, setting)
+    return scene
+
+
 def _set(scene: "Scene", setting: str) -> "Scene":
     """Return the scene with one parameter set as `NAME=VALUE` says."""
     from warpfrag.scene.colors import parse_hex
     from warpfrag.scene.errors import suggest
+    from warpfrag.scene.pose import POSE_KEYS, posed
 
     name, equals, text = setting.partition("=")
     name, text = name.strip(), text.strip()
@@ -365,6 +374,8 @@ def _set(scene: "Scene", setting: str) -> "Scene":
     if name not in known:
         raise UsageError(f'--set: found the unknown name "{name}"; {suggest(name, known)}')
     owner, _, key = name.rpartition(".")
+    if key in POSE_KEYS:
+        return posed(scene, {name: _numbers(f"--set {name}", text, (3,), "x,y,z")})
     if key == "beta":
         return replace(scene, beta=_numbers(f"--set {name}", text, (1,), "a number from 0 to 1")[0])
     objects = []

@@ -18,9 +18,10 @@ from warpfrag.saving import replacing
 from warpfrag.scene.colors import srgb_to_linear
 
 SUFFIXES = (".png", ".exr", ".npy")
-# The header of a PNG file: signature, length and name of the first chunk, width, height, then the bit depth.
+# The header of a PNG file: signature, length and name of the first chunk, width, height, bit depth, colour type.
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_PNG_BIT_DEPTH = 24
+_PNG_BIT_DEPTH, _PNG_COLOR_TYPE = 24, 25
+_PNG_GREY = 0
 
 
 class ImageError(ValueError):
@@ -61,12 +62,15 @@ def read_image(path: str | os.PathLike, *, size: tuple[int, int] | None = None) 
     if size is not None and image.shape[:2] != (size[1], size[0]):
         found = f"{image.shape[1]} × {image.shape[0]}"
         raise ImageError(f"{path}: found {found} pixels, expected {size[0]} × {size[1]}")
+    # What is too large for float32 becomes infinite, and is told below.
+    with np.errstate(over="ignore"):
+        image = np.ascontiguousarray(image, dtype=np.float32)
     if not np.isfinite(image).all():
         row, column = np.argwhere(~np.isfinite(image).all(axis=-1))[0]
         raise ImageError(
             f"{path}: found a value that is not finite at column {column}, row {row}, expected finite ones"
         )
-    return np.ascontiguousarray(image, dtype=np.float32)
+    return image
 
 
 def write_image(path: str | os.PathLike, image: Any, *, bits: int = 8) -> None:
@@ -158,9 +162,12 @@ def _suffix(path: Path) -> str:
 
 def _read_png(path: Path) -> np.ndarray:
     data = path.read_bytes()
-    if not data.startswith(_PNG_SIGNATURE) or len(data) <= _PNG_BIT_DEPTH:
+    if not data.startswith(_PNG_SIGNATURE) or len(data) <= _PNG_COLOR_TYPE:
         raise ImageError(f"{path}: found what is not a PNG file, expected one")
-    return _read_png16(data) if data[_PNG_BIT_DEPTH] == 16 else _read_png8(data)
+    bits = data[_PNG_BIT_DEPTH]
+    # Pillow cuts 16-bit colours to 8 bits without a word, and takes no grey below 8 bits for the transparent one.
+    small_grey = bits < 8 and data[_PNG_COLOR_TYPE] == _PNG_GREY
+    return _read_png_as_stored(data) if bits == 16 or small_grey else _read_png8(data)
 
 
 def _read_png8(data: bytes) -> np.ndarray:
@@ -169,22 +176,27 @@ def _read_png8(data: bytes) -> np.ndarray:
     with warnings.catch_warnings():
         # A huge image is an error all the same once memory runs out; the warning would be a second line.
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        # Decoding ignores checksums, and what is behind the last pixel; verifying leaves nothing to decode.
+        Image.open(io.BytesIO(data), formats=["PNG"]).verify()
         with Image.open(io.BytesIO(data), formats=["PNG"]) as image:
             has_opacity = image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
             stored = np.asarray(image.convert("RGBA" if has_opacity else "RGB"))
     return _decode(stored, 8)
 
 
-def _read_png16(data: bytes) -> np.ndarray:
-    # Pillow cuts 16-bit colours to 8 bits without a word.
+def _read_png_as_stored(data: bytes) -> np.ndarray:
     import png
 
-    width, height, rows, info = png.Reader(bytes=data).asDirect()
+    reader = png.Reader(bytes=data)
+    reader.preamble()
+    # It would cut values to the bits that are said to be significant; all of them are scaled to the full range.
+    reader.sbit = None
+    width, height, rows, info = reader.asDirect()
     stored = np.array([np.asarray(row, dtype=np.uint16) for row in rows]).reshape(height, width, info["planes"])
     if info["greyscale"]:
         grey = np.repeat(stored[..., :1], 3, axis=-1)
         stored = np.concatenate([grey, stored[..., 1:]], axis=-1)
-    return _decode(stored, 16)
+    return _decode(stored, info["bitdepth"])
 
 
 def _write_png(path: Path, pixels: np.ndarray, bits: int) -> None:
@@ -210,9 +222,13 @@ def _read_exr(path: Path) -> np.ndarray:
     openexr = _openexr()
     with openexr.File(str(path), separate_channels=True) as file:
         channels = {name: np.asarray(channel.pixels, dtype=np.float32) for name, channel in file.channels().items()}
+        held, whole = (np.asarray(file.header()[name]).tolist() for name in ("dataWindow", "displayWindow"))
+    if held != whole:
+        raise ImageError(f"{path}: found pixels of the window {held} (first, last), expected those of {whole}")
     color = [channels[name] for name in ("R", "G", "B") if name in channels]
     if len(color) != 3:
-        color = [channels["Y"]] * 3 if "Y" in channels and not color else []
+        grey = "Y" in channels and not color and not {"RY", "BY"} & channels.keys()
+        color = [channels["Y"]] * 3 if grey else []
     if not color:
         raise ImageError(f"{path}: found the channels {', '.join(sorted(channels))}, expected R, G, B (and A), or Y")
     return np.stack([*color, channels["A"]] if "A" in channels else color, axis=-1)

@@ -102,8 +102,8 @@ class Coverage:
     def shade(self, parameters: Mapping[str, Any] | None = None) -> Fragments:
         """Shade the fragments for parameter values; at those of `of` the result is that of `capture`, to the bit.
 
-        Differentiable in all that `capture` is. An opacity that extrapolation takes out of 0 … 1 is clamped; the
-        gradient does not know.
+        Differentiable in all that `capture` is. Opacity and z-thickness that extrapolation takes out of their ranges
+        are clamped, and have no gradient there.
 
         Args:
             parameters: as for `capture`.

@@ -16,6 +16,10 @@ from warpfrag.capture.texture import Lookup, load_rgba, load_uv, look_up, mix3, 
 
 wp.set_module_options({"enable_backward": False})
 
+# An interpolated value that is farther than this outside of its range was extrapolated, and clamped; no rounding does
+# that.
+SLACK = wp.constant(wp.float64(1e-9))
+
 
 @wp.struct
 class Corners:
@@ -201,7 +205,10 @@ def fragment_adjoint(
             at = look_up(texels, textures, own.texture, place)
             texel = texel_between(place, at)
         s = wp.cw_mul(straight, texel)
-        g = wp.vec4d(g[0] * s[3], g[1] * s[3], g[2] * s[3], g[3] + g[0] * s[0] + g[1] * s[1] + g[2] * s[2])
+        grad_opacity = g[3]
+        if s[3] < -SLACK or s[3] > ONE + SLACK:
+            grad_opacity = wp.float64(0.0)
+        g = wp.vec4d(g[0] * s[3], g[1] * s[3], g[2] * s[3], grad_opacity + g[0] * s[0] + g[1] * s[1] + g[2] * s[2])
         to_straight = wp.cw_mul(g, texel)
         to.rgba_a = (ONE - l_b - l_c) * to_straight
         to.rgba_b = l_b * to_straight
@@ -214,8 +221,10 @@ def fragment_adjoint(
             grad_c += wp.dot(to_place, own.uv_c - own.uv_a)
     if grad_fragment_thickness.shape[0] > 0:
         to_own = wp.float64(grad_fragment_thickness[fragment])
+        factor = mix3(own.thickness_a, own.thickness_b, own.thickness_c, l_b, l_c)
+        if factor < -SLACK * wp.max(wp.max(own.thickness_a, own.thickness_b), own.thickness_c):
+            to_own = wp.float64(0.0)
         if own.in_p != 0:
-            factor = mix3(own.thickness_a, own.thickness_b, own.thickness_c, l_b, l_c)
             if own.map >= 0:
                 factor = wp.float64(maps[own.map, rays.first_row * rays.width + pixel])
             depth = hit[2] * along

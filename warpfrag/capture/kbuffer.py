@@ -176,8 +176,8 @@ def capture_kbuffer(
     those of `kbuffer(capture(scene, sort=False), slots)`, to the bit. With `tail="discard"` a fragment behind all slots
     is not shaded (fragment culling of the k+-buffer).
 
-    Differentiable in vertices, colour, opacity and thickness, as `capture` and `kbuffer` are; the gradient captures the
-    fragments again, a few rows of the image at a time.
+    Differentiable in vertices, translations and rotations, colour, opacity and thickness, as `capture` and `kbuffer`
+    are; the gradient captures the fragments again, a few rows of the image at a time.
 
     Args:
         scene: what to capture.

@@ -215,7 +215,8 @@ class Descent:
 
     def _enter(self, stage: int, vector: np.ndarray, end: int) -> None:
         """Begin a stage from a vector of coordinates."""
-        self.stage, self.stage_end, self.scores = stage, end, []
+        self.stage, self.stage_end = stage, end
+        self.scores: list[float] = []
         first = 0
         for coordinate in self.coordinates:
             last = first + coordinate.variable.start.size
@@ -272,7 +273,7 @@ class Adam(Descent):
         if len(self.scores) <= patience:
             return None
         best, before = min(self.scores[-patience:]), min(self.scores[:-patience])
-        stalled = best > (1.0 - self.study.tolerance) * before
+        stalled = best >= (1.0 - self.study.tolerance) * before
         return f"{self.study.patience} steps brought nothing better" if stalled else None
 
     @property

@@ -52,7 +52,7 @@ class UnitFragments:
         """Return the factors of each object's colours and opacity, (objects, 4), and thickness, (objects,)."""
         rgba, thickness = np.ones((len(self.names), 4), np.float32), np.ones(len(self.names), np.float32)
         for variable in fitted:
-            owned, value = self.owned(variable.name, fitted), values.get(variable.name)
+            owned, value = self.owned(variable.name, fitted), np.asarray(values.get(variable.name, 1.0))
             if variable.key == "color":
                 rgba[owned, :3] *= value
             elif variable.key == "opacity":

@@ -54,15 +54,15 @@ def _sum_kernel() -> wp.Kernel:
     @wp.kernel(module="unique", enable_backward=False)
     def sum_columns(
         span: Span,
-        offsets: wp.array(dtype=int),
-        object_id: wp.array(dtype=int),
-        columns: wp.array(dtype=wp.vec3i),
-        rgba_scale: wp.array(dtype=wp.vec4f),
-        unit_rgba: wp.array(dtype=wp.vec4f),
-        thickness: wp.array(dtype=float),
-        grad_rgba: wp.array(dtype=wp.vec4f),
-        grad_thickness: wp.array(dtype=float),
-        sums: wp.array2d(dtype=wp.float64),
+        offsets: wp.array[int],
+        object_id: wp.array[int],
+        columns: wp.array[wp.vec3i],
+        rgba_scale: wp.array[wp.vec4f],
+        unit_rgba: wp.array[wp.vec4f],
+        thickness: wp.array[float],
+        grad_rgba: wp.array[wp.vec4f],
+        grad_thickness: wp.array[float],
+        sums: wp.array2d[wp.float64],
     ):
         for pixel in range(span.begin + wp.tid(), span.end, span.stride):
             for fragment in range(offsets[pixel], offsets[pixel + 1]):

@@ -17,7 +17,7 @@ from warpfrag.composite import composite
 from warpfrag.fit.frozen import UnitFragments
 from warpfrag.fit.parameters import in_multiples_of_p
 from warpfrag.fit.processes import Processes
-from warpfrag.fit.study import RENDER_OPTIONS, Study, StudyError, View, true_of_view
+from warpfrag.fit.study import RENDER_OPTIONS, Study, View, true_of_view
 from warpfrag.fragments import Fragments
 from warpfrag.interop.operator import kind_of
 from warpfrag.resolve.kbuffer import kbuffer
@@ -34,9 +34,6 @@ class ViewProblem:
         study: the study.
         view: the view.
         index: its place among the fitted views; 0 for one that is held out, for which no value is stacked.
-
-    Raises:
-        StudyError: the reference image has another size than the camera.
     """
 
     def __init__(self, study: Study, view: View, index: int) -> None:
@@ -102,10 +99,7 @@ class Problem:
 
     Args:
         study: the study.
-        processes: those that share the work; None for a single one.
-
-    Raises:
-        StudyError: a reference image has another size than its camera.
+        processes: those that share the work; None for those of this program.
     """
 
     def __init__(self, study: Study, processes: Processes | None = None) -> None:
@@ -191,24 +185,12 @@ def reference_image(study: Study, view: View, index: int = 0) -> np.ndarray:
         study: the study.
         view: the view.
         index: its place among the fitted views.
-
-    Raises:
-        StudyError: it has another size than the camera.
     """
     reference, scene = view.reference, replace(study.scene, camera=view.camera)
     assert reference is not None
     height, width = view.camera.shape
     if reference.image is not None:
         image = np.asarray(reference.image, np.float32)
-        if image.ndim != 3 or image.shape[2] not in (3, 4) or not np.isfinite(image).all():
-            raise StudyError(
-                f"{reference.source}: found shape {image.shape}, expected finite values of shape (H, W, 3 or 4)"
-            )
-        if image.shape[:2] != (height, width):
-            found = f"{image.shape[1]} × {image.shape[0]}"
-            raise StudyError(
-                f"{reference.source}: found {found} pixels, expected {width} × {height} like the study's camera"
-            )
         if image.shape[2] == 4:
             image = image + (1.0 - image[..., 3:]) * np.asarray(scene.background, np.float32)
         return image

@@ -2,10 +2,8 @@
 
 import json
 import math
-import platform
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +13,7 @@ from warpfrag.fit.losses import psnr
 from warpfrag.fit.parameters import value_words
 from warpfrag.images import write_image
 from warpfrag.saving import replacing
+from warpfrag.versions import package_versions
 
 # Arrays with more numbers than this are written beside result.json, not into it.
 MOST_NUMBERS = 256
@@ -180,7 +179,7 @@ class FitResult:
             "views": [_plain({"name": v.name, "held_out": v.held_out, "psnr": v.psnr}) for v in self.views],
             "runs": [self._run_to_json(index, run, arrays) for index, run in enumerate(self.runs)],
             **_plain(self.setting),
-            "versions": _versions(),
+            "versions": package_versions(),
         }
 
     @staticmethod
@@ -251,13 +250,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, (float, np.floating)):
         return float(value) if math.isfinite(value) else None
     return value
-
-
-def _versions() -> dict[str, str]:
-    versions = {"python": platform.python_version()}
-    for name in ("warpfrag", "warp-lang", "numpy", "scipy", "torch"):
-        try:
-            versions[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    return versions

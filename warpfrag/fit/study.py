@@ -44,8 +44,9 @@ class Reference:
     """The image to approach: a given one, or a render of the study's scene.
 
     Attributes:
-        image: linear premultiplied image (H, W, 4), or (H, W, 3) where opacity is not to be compared; None to render.
-            One with opacity is laid over the scene's background, if the scene has one.
+        image: linear premultiplied image of floats (H, W, 4), or (H, W, 3) where opacity is not to be compared (in a
+            scene without a background that is the image over black); None to render. One with opacity is laid over the
+            scene's background, if the scene has one.
         true: values to render with, by parameter name; those of the scene where there is none. None with an image.
         supersampling: samples along each edge of a pixel; their mean (a box filter) is the reference.
         merge: in place of the study's, for the reference alone; so are `mix` and `layers`.
@@ -297,11 +298,29 @@ def _check_reference(view: View, scene: Scene, count: int) -> None:
         scene, true = in_multiples_of_p(scene, true_of_view(reference, 0, count), "reference.true")
         assemble(scene, true, camera=view.camera)
         _check_beta(reference.true.get("beta", 0.0), view.camera, count)
-    elif reference.supersampling != 1 or any(getattr(reference, key) is not None for key in RENDER_OPTIONS):
-        raise StudyError("reference: found options of a render with an image, expected them with true")
+    else:
+        if reference.supersampling != 1 or any(getattr(reference, key) is not None for key in RENDER_OPTIONS):
+            raise StudyError("reference: found options of a render with an image, expected them with true")
+        _check_image(reference, view.camera)
     samples = reference.supersampling
     if isinstance(samples, bool) or not isinstance(samples, int) or not 1 <= samples <= 64:
         raise StudyError(f"reference.supersampling: found {shorten(samples)}, expected a whole number from 1 to 64")
+
+
+def _check_image(reference: Reference, camera: Camera) -> None:
+    try:
+        image = np.asarray(reference.image)
+    except ValueError:
+        image = np.asarray(None)
+    where, expected = reference.source, "linear floating-point numbers of shape (H, W, 3 or 4)"
+    if image.dtype.kind != "f" or image.ndim != 3 or image.shape[2] not in (3, 4):
+        raise StudyError(f"{where}: found {image.dtype} of shape {image.shape}, expected {expected}")
+    if image.shape[:2] != camera.shape:
+        found, wanted = f"{image.shape[1]} × {image.shape[0]}", f"{camera.size[0]} × {camera.size[1]}"
+        raise StudyError(f"{where}: found {found} pixels, expected {wanted} like the study's camera")
+    if not np.isfinite(image).all():
+        row, column = np.argwhere(~np.isfinite(image).all(axis=-1))[0]
+        raise StudyError(f"{where}: found a value that is not finite at column {column}, row {row}")
 
 
 def _check_beta(value: Any, camera: Camera, count: int) -> None:

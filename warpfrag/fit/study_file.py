@@ -40,7 +40,7 @@ from warpfrag.scene.table import Table, is_number, is_numbers, read_toml
 
 _INTEGERS = ("steps", "seed", "restarts", "scales", "patience", "batch")
 _NUMBERS = ("delta", "tolerance", "learning_rate", "checkpoint_seconds")
-_TOP = ("scene", "size", "reference", "view", "parameters", "loss", "method", "resolve", "device")
+_TOP: tuple[str, ...] = ("scene", "size", "reference", "view", "parameters", "loss", "method", "resolve", "device")
 _TOP += (*_INTEGERS, *_NUMBERS, *RENDER_OPTIONS)
 _PARAMETER = ("start", "lower", "upper", "per", "learning_rate", "smoothness", "levels")
 _MOST_PIXELS, _MOST_STEPS = 65536, 10**9

@@ -95,6 +95,8 @@ def load_scene(path: str | os.PathLike) -> Scene:
     objects: list[SceneObject] = []
     for index, entry in enumerate(entries):
         item = _object(entry, path, index, meshes, camera, light)
+        if item.name == "camera":
+            raise SceneError(f'{path}: object[{index}].name: found "camera", expected another: the camera has it')
         for other, earlier in enumerate(objects):
             if earlier.name == item.name:
                 found = f'"{item.name}", which object[{other}] has too'

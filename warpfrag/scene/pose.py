@@ -14,6 +14,7 @@ what is computed, so that a pose of zeros changes no bit.
 import math
 import sys
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -125,29 +126,73 @@ def pose_matrix(
         raise ValueError(
             f"name: found {shorten(name)}, expected the translation or rotation of an object or the camera"
         )
-    values = {
-        f"{place}.{part}": _host((parameters or {}).get(f"{place}.{part}", np.zeros(3)))
-        for place in {owner, "camera"}
-        for part in POSE_KEYS
-    }
+    translation, rotation = pose_values(owner, parameters or {})
+    camera_translation, camera_rotation = pose_values("camera", parameters or {})
     view = (camera or scene.camera).view_matrix()
-    turned = rotation_matrix(values["camera.rotation"]).T
+    turned = rotation_matrix(camera_rotation).T
     by_force, by_torque = np.zeros((3, 3)), np.zeros((3, 3))
     if name == "camera.translation":
         by_force = -turned
     elif name == "camera.rotation":
-        by_torque = -turned @ left_jacobian(values[name]) * RADIANS
+        by_torque = -turned @ left_jacobian(rotation) * RADIANS
     else:
         axes = turned @ view[:3, :3]
         if key == "translation":
             by_force = axes
         else:
-            pivot = owned[0].middle() + values[f"{owner}.translation"]
-            seen = turned @ (view[:3, :3] @ pivot + view[:3, 3] - values["camera.translation"])
+            pivot = owned[0].middle() + translation
+            seen = turned @ (view[:3, :3] @ pivot + view[:3, 3] - camera_translation)
             # About the pivot c the torque is Σ (p − c) × g.
-            by_torque = axes @ left_jacobian(values[name]) * RADIANS
+            by_torque = axes @ left_jacobian(rotation) * RADIANS
             by_force = -cross_matrix(seen).T @ by_torque
     return np.concatenate([by_force, by_torque])
+
+
+def pose_values(owner: str, parameters: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the translation and rotation of an object or the camera, (3,) float64 each; zeros where none is given.
+
+    Raises:
+        ValueError: one of them is not 3 finite numbers.
+    """
+    found = []
+    for name in (f"{owner}.{key}" for key in POSE_KEYS):
+        value = parameters.get(name, (0.0, 0.0, 0.0))
+        value = value.detach().cpu().numpy() if hasattr(value, "detach") else value
+        array = np.asarray(value, dtype=np.float64)
+        if array.shape != (3,) or not np.isfinite(array).all():
+            raise ValueError(f"{name}: found {shorten(value)}, expected 3 finite numbers")
+        found.append(array)
+    return found[0], found[1]
+
+
+def posed(scene: "Scene", parameters: Mapping[str, Any]) -> "Scene":
+    """Return a scene with poses built into its matrices and its camera: it renders as with these parameters.
+
+    Args:
+        scene: the scene.
+        parameters: translations and rotations by name; anything else is passed over.
+
+    Raises:
+        ValueError: a pose is not 3 finite numbers.
+    """
+    owners = {name.rpartition(".")[0] for name in parameters if name.rpartition(".")[2] in POSE_KEYS}
+    objects = list(scene.objects)
+    for index, item in enumerate(objects):
+        if item.name in owners:
+            translation, vector = pose_values(item.name, parameters)
+            motion = np.eye(4)
+            motion[:3, :3] = rotation = rotation_matrix(vector)
+            motion[:3, 3] = item.middle() - rotation @ item.middle() + translation
+            objects[index] = replace(item, matrix=motion @ item.matrix)
+    camera = scene.camera
+    if "camera" in owners:
+        translation, vector = pose_values("camera", parameters)
+        axes = camera.view_matrix()[:3, :3].T
+        _, down, forward = (axes @ rotation_matrix(vector)).T
+        eye = camera.eye + axes @ translation
+        target = eye + np.linalg.norm(np.subtract(camera.target, camera.eye)) * forward
+        camera = replace(camera, eye=tuple(eye), target=tuple(target), up=tuple(-down))
+    return replace(scene, objects=objects, camera=camera)
 
 
 def _rotation_change(vector: Any) -> Any:
@@ -200,8 +245,3 @@ def _stacked(columns: list[Any], like: Any) -> Any:
     if _namespace(like) is np:
         return np.stack(columns, 1).astype(like.dtype)
     return sys.modules["torch"].stack(columns, 1).to(like.dtype)
-
-
-def _host(value: Any) -> np.ndarray:
-    value = value.detach().cpu().numpy() if hasattr(value, "detach") else value
-    return np.asarray(value, dtype=np.float64)

@@ -31,6 +31,16 @@ OPACITIES = (1.0, 0.6)
 OTHER_EYE = (-2.2, 2.4, 2.1)
 RULE = "|g₁ − g₂|"
 OWN = "|g₁|, |g₂|: each its own"
+METHODS = {
+    "none": "no merging",
+    "2P": "t = 2·P(z)",
+    "hand-set": "0.02 × height",
+    "pixel size": "pixel size",
+    "global": "fitted, global",
+    "per object": "fitted, per object",
+    "rule": "rule",
+    "per pixel": "fitted, per pixel",
+}
 BETAS = (0.0, 0.5, 1.0)
 # Where fits start: the better of two ends counts, as there is a minimum at either end of beta. In pixel sizes, and
 # thick, as there is no gradient where slabs do not overlap.
@@ -185,7 +195,8 @@ def best_factor(some: Sequence[Case], footprint: str, beta: float = 1.0) -> floa
     # From a grid first: towards thick slabs the curve has further maxima, low ones.
     grid = np.log(np.geomspace(0.1, 5.0, 21))
     start = int(np.clip(np.argmin([loss(value) for value in grid]), 1, len(grid) - 2))
-    found = minimize_scalar(loss, bracket=tuple(grid[start - 1 : start + 2]), tol=1e-3)
+    bounds = (grid[start - 1], grid[start + 1])
+    found = minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": 1e-3})
     return float(np.exp(found.x))
 
 
@@ -223,17 +234,16 @@ def best_thickness(case: Case) -> dict[str, np.ndarray]:
 def summarise(size: int, all_cases: list[Case], factors: dict[str, float], best: dict[str, Any]) -> Summary:
     """Put the numbers into words and tables."""
     fitted, others = [c for c in all_cases if c.fitted], [c for c in all_cases if not c.fitted]
-    methods = list(all_cases[0].images)
 
     def mean(some: Sequence[Case], image: Callable[[Case], np.ndarray]) -> float:
         return float(np.mean([case.psnr(image(case), case.band) for case in some]))
 
     def psnrs(mask: str | None, caption: str) -> Table:
         rows = tuple(
-            (case.title, *(f"{case.psnr(case.images[m], mask and getattr(case, mask)):.1f}" for m in methods))
+            (case.title, *(f"{case.psnr(case.images[m], mask and getattr(case, mask)):.1f}" for m in METHODS))
             for case in all_cases
         )
-        return Table(("", *methods), rows, caption)
+        return Table(("", *METHODS.values()), rows, caption)
 
     candidates = []
     for name, factor in factors.items():
@@ -241,7 +251,7 @@ def summarise(size: int, all_cases: list[Case], factors: dict[str, float], best:
         again = np.mean([case.psnr(case.by_rule(name, best_factor([case], name)), case.band) for case in others])
         low, middle, high = quartiles(best, name) if name in all_cases[0].footprints else (0.0, 0.0, 0.0)
         spread = f"{middle:.2f} ({low:.2f} … {high:.2f})" if middle else "–"
-        candidates.append((f"`{name}`", f"{factor:.2f}", spread, *at_home, f"{again:.1f}"))
+        candidates.append((name, f"{factor:.2f}", spread, *at_home, f"{again:.1f}"))
     found = []
     for case in all_cases:
         one, several = case.fits["scene"].found, case.fits["object"].found
@@ -261,12 +271,12 @@ def summarise(size: int, all_cases: list[Case], factors: dict[str, float], best:
     )
     low, middle, high = quartiles(best, RULE)
     answer = (
-        f"The best thickness is t = {factors[RULE]:.2f}·|g₁ − g₂| for both surfaces, where g is the change of a "
-        f"surface's depth along the ray from pixel to pixel (a gradient): the *difference* of the two footprints, not "
-        f"the pixel size and not either surface's own. Searched pixel by pixel, t/|g₁ − g₂| has median {middle:.2f} and "
-        f"quartiles {low:.2f} and {high:.2f}. Carried over to another view, another resolution and another scene, the "
-        f"rule reaches {rule:.1f} dB in the band around intersections (mean of {len(others)} cases), against {one:.1f} "
-        f"with one thickness fitted to each of these images, {pixel:.1f} with the pixel size and {none:.1f} unmerged."
+        f"t = {factors[RULE]:.2f}·|g₁ − g₂| for both surfaces, where g is the gradient of a surface's depth along the "
+        f"ray from pixel to pixel: the length of the *difference* of the two footprints, neither the pixel size nor "
+        f"either surface's own. Searched pixel by pixel, t/|g₁ − g₂| has median {middle:.2f} and quartiles {low:.2f} "
+        f"and {high:.2f}. Carried over to another view, resolution and scene, the rule reaches {rule:.1f} dB in the "
+        f"band around intersections (mean of {len(others)} images), against {one:.1f} with one thickness fitted to "
+        f"each of them, {pixel:.1f} with the pixel size and {none:.1f} unmerged."
     )
     numbers = {
         "factor": factors[RULE],
@@ -300,7 +310,7 @@ def summarise(size: int, all_cases: list[Case], factors: dict[str, float], best:
             Table(
                 ("β", *(f"A = {case.opacity:g}" for case in fitted)),
                 tuple(betas),
-                "PSNR of the band [dB] by β, thickness by the rule, in the first view, with the best factor in brackets:",
+                "PSNR of the band [dB] by β, thickness by the rule with its best factor (in brackets), first view:",
             ),
         ),
         figures=(

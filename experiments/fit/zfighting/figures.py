@@ -77,7 +77,7 @@ def multiples(data: dict[str, Any]) -> Figure:
 def _curves(axis: Any, data: dict[str, Any]) -> None:
     for way, buffers in data["curves"].items():
         for buffer, rows in buffers.items():
-            label = f"{way.replace('SFM, β', 'SFM, β')}" + (", β = 1" if way == "SFM" else "")
+            label = "SFM, β = 1" if way == "SFM" else way
             axis.plot(
                 data["multiples"],
                 np.maximum(rows[:, 1], 1e-5),
@@ -86,14 +86,14 @@ def _curves(axis: Any, data: dict[str, Any]) -> None:
                 label=label if buffer == "fixed" else None,
             )
     axis.axhline(VISIBLE, color="#888888", lw=0.8)
-    axis.text(0.27, VISIBLE * 0.93, "1/255", color="#555555", fontsize=8, va="top")
+    axis.text(0.27, VISIBLE * 1.06, "1/255", color="#555555", fontsize=8, va="bottom")
     for multiple in (2.0, 10.0, 100.0):
         axis.axvline(multiple, color="#bbbbbb", lw=0.8, zorder=0)
         axis.text(multiple * 1.06, 0.68, f"{multiple:g} P", color="#777777", fontsize=8, ha="left")
     axis.set(xscale="log", yscale="log", ylim=(8e-4, 1.0), xlim=(0.25, 4096.0))
     axis.set(xlabel="thickness [P(z)]", ylabel=f"deviation that {FEW:.1%} of the pixels pass")
     axis.set_title("(a) Coplanar, z = 10 near (green: 24-bit z-buffer, red: rasterised)")
-    axis.legend(loc="lower left", bbox_to_anchor=(0.0, 0.03))
+    axis.legend(loc="upper right", bbox_to_anchor=(1.0, 0.92))
 
 
 def _depths(axis: Any, data: dict[str, Any]) -> None:

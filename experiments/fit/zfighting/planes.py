@@ -18,7 +18,7 @@ from warpfrag.scene.objects import Scene, SceneObject
 
 BUFFERS = ("eye", "fixed", "float", "rasteriser")
 # Columns, rows and turn in the plane [degrees] of the two planes' triangles: none in common.
-TRIANGLES = ((7, 5, 0.0), (6, 11, 31.0))
+TRIANGLES = ((29, 23, 0.0), (27, 41, 31.0))
 COLORS = ((0.9, 0.05, 0.04), (0.04, 0.1, 0.9))
 # Vertical opening [degrees]: small, so that the depth in the middle stands for that of all pixels.
 FOV = 8.0
@@ -34,7 +34,8 @@ class Setting:
         z: distance of their middle from the eye [near].
         far: distance of the far plane [near].
         tilt: angle between their normal and the middle ray [degrees].
-        offset: how far the second is behind the first along the middle ray [P(z)].
+        offset: how far the first is behind the second along the middle ray [P(z)]: where rounding makes their depths
+            equal, order of submission then gets it wrong.
         origin: distance of the eye from the origin of world space [z].
         opacity: of both.
         bits: of the depth buffer, and of P.
@@ -105,9 +106,11 @@ def make_scene(setting: Setting) -> Scene:
         mesh = primitives.grid((3.0 * reach * setting.z, 3.0 * reach * setting.z), (columns, rows))
         matrix = np.eye(4)
         matrix[:3, :3] = turned @ _rotation(2, turn)
-        matrix[:3, 3] = eye + [0.0, 0.0, -setting.z - index * setting.offset * setting.resolution]
-        name, color = ("first", "second")[index], COLORS[index]
-        objects.append(SceneObject(name, mesh.vertices, mesh.faces, matrix=matrix, color=color, opacity=setting.opacity))
+        matrix[:3, 3] = eye + _middle(setting, index)
+        item = SceneObject(
+            ("first", "second")[index], mesh.vertices, mesh.faces, matrix, COLORS[index], setting.opacity
+        )
+        objects.append(item)
     size = (setting.size, setting.size)
     target = eye - [0.0, 0.0, setting.z]
     return Scene(Camera(tuple(eye), tuple(target), fov=FOV, near=1.0, far=setting.far, size=size), objects)
@@ -120,8 +123,7 @@ def true_depths(setting: Setting, scene: Scene) -> np.ndarray:
     depths = []
     for index, item in enumerate(scene.objects):
         normal = item.matrix[:3, 2]
-        point = np.array([0.0, 0.0, -setting.z - index * setting.offset * setting.resolution])
-        depths.append(normal @ point / (directions @ normal))
+        depths.append(normal @ _middle(setting, index) / (directions @ normal))
     # Distance along the ray, not the planar depth.
     return (np.stack(depths, -1) * np.linalg.norm(directions, axis=-1)[:, None]).ravel()
 
@@ -147,14 +149,14 @@ def stored_depths(buffer: str, setting: Setting, scene: Scene, fragments: wf.Fra
     if buffer == "rasteriser":
         window = _interpolated(corners, x, y, camera)
     else:
-        planar = fragments_planar(corners, x, y, camera)
+        planar = _planar_depths(corners, x, y, camera)
         window = camera.far / (camera.far - camera.near) * (1.0 - camera.near / planar)
     step = 2.0**-setting.bits
     kept = window.astype(np.float32).astype(np.float64) if buffer == "float" else np.rint(window / step) * step
     return camera.near * camera.far / (camera.far - kept * (camera.far - camera.near)) * stretch
 
 
-def fragments_planar(corners: np.ndarray, x: np.ndarray, y: np.ndarray, camera: Camera) -> np.ndarray:
+def _planar_depths(corners: np.ndarray, x: np.ndarray, y: np.ndarray, camera: Camera) -> np.ndarray:
     """Return the planar depth of fragments on triangles (n, 3, 3) in camera space, at pixels [from the middle]."""
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     directions = np.stack([x / camera.focal, y / camera.focal, np.ones_like(x)], -1)
@@ -180,6 +182,12 @@ def _corners(scene: Scene, fragments: wf.Fragments) -> np.ndarray:
     geometry = assemble(scene)
     points = to_camera_space(geometry.vertices, scene.camera).astype(np.float64)
     return points[geometry.faces[geometry.first_face[fragments.object_id] + fragments.primitive_id]]
+
+
+def _middle(setting: Setting, index: int) -> np.ndarray:
+    """Return where the middle of a plane is, seen from the eye [near], (3,)."""
+    behind = setting.offset * setting.resolution if index == 0 else 0.0
+    return np.array([0.0, 0.0, -setting.z - behind])
 
 
 def _pixels(camera: Camera) -> tuple[np.ndarray, np.ndarray]:

@@ -4,8 +4,9 @@ A pixel speckles if it is further than 1/255 (linear light, worst channel) from 
 without noise in the depths. Speckle is gone if no more than a pixel in a thousand is left.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from planes import BUFFERS, Pair, Setting, make_pair
@@ -35,7 +36,7 @@ class Case:
     smallest: dict[str, dict[str, float]]
 
 
-def composite(pair: Pair, depth: np.ndarray, multiple: float, merge: str, beta: float) -> np.ndarray:
+def composite(pair: Pair, depth: np.ndarray, multiple: float, merge: Any, beta: float) -> np.ndarray:
     """Composite the planes with given depths, `multiple` P(z) thick, in the precision of the depths; (H W, 4)."""
     setting = pair.setting
     thickness = multiple * wf.z_resolution(depth, 1.0, setting.far, setting.bits)
@@ -44,7 +45,7 @@ def composite(pair: Pair, depth: np.ndarray, multiple: float, merge: str, beta: 
     return wf.composite(fragments, beta, merge=merge)
 
 
-def clean_image(pair: Pair, multiple: float, merge: str, beta: float) -> np.ndarray:
+def clean_image(pair: Pair, multiple: float, merge: Any, beta: float) -> np.ndarray:
     """Return the image without noise; of coplanar planes it is the same for every multiple, way and beta."""
     if pair.setting.offset == 0.0:
         merge, multiple = "order_independent", 1.0
@@ -83,7 +84,7 @@ def examine(setting: Setting, buffers: Sequence[str] = BUFFERS, ways: Sequence[s
     return Case(setting, {way: {name: smallest_multiple(pair, name, way) for name in buffers} for way in ways})
 
 
-def left_over(pair: Pair, buffer: str, way: str, multiples: Sequence[float]) -> np.ndarray:
+def left_over(pair: Pair, buffer: str, way: str, multiples: Iterable[float]) -> np.ndarray:
     """Return share of speckled pixels, and the deviation that one in a thousand passes, at multiples; (n, 2)."""
     rows = []
     for multiple in multiples:
@@ -92,7 +93,7 @@ def left_over(pair: Pair, buffer: str, way: str, multiples: Sequence[float]) -> 
     return np.array(rows)
 
 
-def offset_curve(base: Setting, buffer: str, way: str, multiple: float, offsets: Sequence[float]) -> np.ndarray:
+def offset_curve(base: Setting, buffer: str, way: str, multiple: float, offsets: Iterable[float]) -> np.ndarray:
     """Return the root mean square deviation of planes that are `offsets` P(z) apart; thickness 0 is no merging."""
     merge, beta = WAYS[way] if multiple else ("none", 1.0)
     pairs = (make_pair(replace(base, offset=float(offset))) for offset in offsets)

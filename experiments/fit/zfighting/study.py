@@ -13,9 +13,9 @@ import warp as wp
 
 wp.config.log_level = wp.LOG_WARNING
 
-from figures import draw  # noqa: E402
+from figures import NAMES, draw  # noqa: E402
 from planes import Setting, make_pair  # noqa: E402
-from speckle import FEW, VISIBLE, WAYS, Case, examine, left_over, offset_curve  # noqa: E402
+from speckle import VISIBLE, WAYS, Case, examine, left_over, offset_curve  # noqa: E402
 
 import warpfrag as wf  # noqa: E402
 from warpfrag.fit import load_study  # noqa: E402
@@ -29,11 +29,15 @@ RATIOS = (4.0, 10.0, 1e2, 1e4, 1e6)
 TILTS = (0.0, 15.0, 30.0, 45.0, 55.0, 65.0, 75.0)
 ORIGINS = (1.0, 10.0, 100.0, 1000.0)
 BITS = (16, 20, 24, 28)
+# Depth buffers of the tables; a float32 z-buffer is as a 24-bit one.
+SHOWN = ("fixed", "rasteriser", "eye")
 OPACITIES = (0.3, 0.8, 0.99)
 MULTIPLES = np.geomspace(0.25, 4096.0, 85)
 OFFSETS = (*np.arange(0.0, 4.0, 0.25), *np.geomspace(4.0, 400.0, 21))
 # How near the near plane the far one varies [near].
 CLOSE_BY = 1.8
+# Depth of the planes in study.toml [near].
+FITTED_DEPTH = 2.0
 # Unit in the last place of a float32 between 1 and 2.
 EPSILON = 2.0**-23
 
@@ -44,17 +48,15 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=128, help="width and height of the images [pixels]")
     base = Setting(size=parser.parse_args().size)
     pair = make_pair(base)
-    some = ("eye", "fixed", "rasteriser")
     data: dict[str, Any] = {
         "depth": [examine(replace(base, z=z)) for z in DEPTHS],
-        "ratio": [examine(replace(base, z=CLOSE_BY, far=ratio), some) for ratio in RATIOS],
-        "tilt": [examine(replace(base, tilt=tilt), some) for tilt in TILTS],
-        "origin": [examine(replace(base, origin=origin), some) for origin in ORIGINS],
+        "ratio": [examine(replace(base, z=CLOSE_BY, far=ratio), SHOWN) for ratio in RATIOS],
+        "tilt": [examine(replace(base, tilt=tilt), SHOWN) for tilt in TILTS],
+        "origin": [examine(replace(base, origin=origin), SHOWN) for origin in ORIGINS],
         "bits": [examine(replace(base, bits=bits)) for bits in BITS],
         "opacity": [examine(replace(base, opacity=opacity), ("fixed",), tuple(WAYS)) for opacity in OPACITIES],
         "multiples": MULTIPLES,
-        "curves": {way: {name: left_over(pair, name, way, MULTIPLES) for name in some[1:]} for way in WAYS},
-        "left": {name: left_over(pair, name, "SFM", PAPER) for name in some},
+        "curves": {way: {name: left_over(pair, name, way, MULTIPLES) for name in SHOWN[:2]} for way in WAYS},
         "offsets": OFFSETS,
         "offset": {
             "none": offset_curve(base, "fixed", "SFM", 0.0, OFFSETS),
@@ -112,9 +114,7 @@ def fit() -> dict[str, float]:
         return float(np.mean(np.abs(image - result.reference).max(axis=-1)[both] > VISIBLE))
 
     return {
-        "red": float(result.found["red.thickness"]),
-        "blue": float(result.found["blue.thickness"]),
-        "steps": result.steps,
+        "multiple": float(result.found["thickness"]),
         "before": speckled(result.before),
         "after": speckled(result.after),
     }
@@ -127,48 +127,48 @@ def report(data: dict[str, Any]) -> None:
     depth, tilt = data["depth"], data["tilt"]
     rasterised = [case.smallest["OFM"]["rasteriser"] for key in ("depth", "ratio", "tilt") for case in data[key]]
     own = [case.setting.z for case in depth if case.smallest["OFM"]["eye"] <= PAPER[0]]
-    own_smooth = [case.setting.z for case in depth if case.smallest["SFM"]["eye"] <= PAPER[0]]
     fixed = max(case.smallest["OFM"]["fixed"] for key in ("depth", "ratio", "tilt") for case in data[key])
     least, most = min(map(min, ratios.values())), max(map(max, ratios.values()))
     found = data["fit"]
-    answer = f"""A 24-bit z-buffer's own rounding is outdone by {fixed:.2f} P(z), at every depth, near/far ratio and tilt:
-the paper's 2 P(z) merges coplanar planes everywhere, with room to spare. A rasteriser that rounds corners in float32
-and to 1/256 pixel needs {min(rasterised):.0f} to {max(rasterised):.0f} P(z), and 2 P(z) is not enough for planes that
-are near or tilted. warpfrag's float32 distances need less than 2 P(z) from z = {min(own):g} near on. Merged is not yet
-even: SFM lets noise / thickness of the order through, so that speckle falls below 1/255 only at {least:.0f} to
-{most:.0f} times the noise, by opacity and β; order-independent merging (OFM) leaves none."""
-    rule = f"""**Rule.** The thinnest slabs that merge coplanar planes in all cases of figure (c), ε = 2⁻²³:
-t = {storage:.2f} P(z) for a z-buffer + {distance:.2f} ε z + {world:.2f} ε (distance from the origin of the world) and, if
-it is rasterised, + {projection:.2f} P(z) + {corners:.2f} p / 256, p being how far the surface recedes from a pixel to
-the next. For SFM to be even to 1/255, times the number of the table by opacity.
-
-**Fit.** `study.toml` fits both thicknesses, from 2 P(z), to an even mix where a third plane 200 P(z) in front must stay
-apart: {found["red"]:.0f} and {found["blue"]:.0f} P(z) in {found["steps"]} steps, as thick as the gap allows. Where the two
-overlap {found["before"]:.1%} of the pixels speckle at 2 P(z), {found["after"]:.1%} after the fit."""
-    names = {"fixed": "24-bit z-buffer", "rasteriser": "rasterised, 24-bit", "eye": "float32 distance (warpfrag)"}
+    answer = (
+        f"{fixed:.1f} P(z) merges what a 24-bit z-buffer's own rounding sets apart, at every depth, near/far ratio and "
+        f"tilt, so the paper's 2 P(z) is enough; after a rasteriser's rounding it takes {min(rasterised):.0f} to "
+        f"{max(rasterised):.0f} P(z), most where planes are near or tilted, and for warpfrag's float32 distances less "
+        f"than 2 P(z) from z = {min(own):g} near on. That is for an even mix (OFM): under SFM merged slabs still show "
+        f"their order by noise / thickness, which falls below 1/255 only at {least:.0f} to {most:.0f} times the noise."
+    )
+    needed = next(case.smallest["SFM"]["eye"] for case in depth if case.setting.z == FITTED_DEPTH)
+    fitted = (
+        f"`study.toml` fits the thickness, from 2 P(z), to an even mix of two planes at z = {FITTED_DEPTH:g} near, "
+        f"where a third one 200 P(z) before them must stay apart: {found['multiple']:.0f} P(z), as thick as the gap "
+        f"allows, and above the {needed:.0f} P(z) that the table has there. Of the pixels where only the two overlap "
+        f"{found['before']:.1%} speckle at 2 P(z), {found['after']:.1%} after the fit."
+    )
+    shared = f"{distance:.1f} ε z + {world:.1f} ε R"
     tables = (
         Table(
-            ("z [near]", *(f"{name}: {way}" for name in names.values() for way in ("OFM", "SFM"))),
+            ("z [near]", *(NAMES[name] for name in SHOWN)),
             tuple(
-                (f"{c.setting.z:g}", *(_multiple(c.smallest[way][name]) for name in names for way in ("OFM", "SFM")))
+                (f"{c.setting.z:g}", *(f"{_word(c.smallest['OFM'][n])} / {_word(c.smallest['SFM'][n])}" for n in SHOWN))
                 for c in depth
             ),
-            "Smallest multiple of P(z) without speckle (≤ 0.1 % of the pixels off by more than 1/255); far plane at "
-            "10⁴ near, tilt 55°, opacity 0.8, β = 1; – where the noise shows in fewer pixels than that.",
+            "Smallest multiple of P(z) without speckle, OFM / SFM at β = 1; far plane at 10⁴ near, tilt 55°, opacity "
+            "0.8; – where no more than 0.1 % of the pixels speckle anyway.",
+        ),
+        Table(
+            ("depth buffer", "thickness that merges coplanar planes"),
+            (
+                (NAMES["eye"], shared),
+                (NAMES["fixed"], f"{storage:.1f} P(z) + {shared}"),
+                (NAMES["rasteriser"], f"{storage + projection:.1f} P(z) + {shared} + {corners:.1f} p / 256"),
+            ),
+            "The rule: the least that is enough in all cases of figure (c). ε = 2⁻²³; R: how far the scene is from the "
+            "origin of the world; p: how far the surface recedes from one pixel to the next.",
         ),
         Table(
             ("opacity", "β = 1", "β = 0"),
             tuple((f"{opacity:g}", *(f"{ratio:.0f}" for ratio in pair)) for opacity, pair in ratios.items()),
-            "Thickness that SFM needs, in multiples of the noise (of what OFM needs).",
-        ),
-        Table(
-            ("thickness", *(f"{name}: {what}" for name in names.values() for what in ("speckled", "off by"))),
-            tuple(
-                (f"{k:g} P(z)", *(cell for name in names for cell in _left(data["left"][name][index])))
-                for index, k in enumerate(PAPER)
-            ),
-            "What SFM leaves at the paper's thicknesses, z = 10 near: share of speckled pixels, and the deviation "
-            "that one in a thousand passes.",
+            "What to multiply that with for SFM to be even to 1/255.",
         ),
     )
     numbers = {
@@ -181,18 +181,18 @@ overlap {found["before"]:.1%} of the pixels speckle at 2 P(z), {found["after"]:.
         "rule, p / 256": corners,
         "rule, ε z": distance,
         "rule, ε origin": world,
-        "fit, red [P]": found["red"],
+        "fit [P]": found["multiple"],
         "fit, speckled after": found["after"],
     }
     Summary(
         name="zfighting",
         title="z-fighting",
         question="How many P(z) thick must slabs be for coplanar planes not to speckle?",
-        answer=f"{answer}\n\n{rule}",
+        answer=f"{answer}\n\n{fitted}",
         tables=tables,
         figures=(
-            Figure("figures/speckle.png", "Coplanar planes at z = 10 near, tilted by 55°, as two depth buffers leave them"),
-            Figure("figures/multiples.png", "Speckle by thickness, smallest multiples, the rule, nearly coplanar planes"),
+            Figure("figures/speckle.png", "Coplanar planes at z = 10 near, as two depth buffers leave them"),
+            Figure("figures/multiples.png", "Speckle by thickness; smallest multiples; the rule; offset planes"),
         ),
         numbers=numbers,
         command="uv run python experiments/fit/zfighting/study.py",
@@ -204,14 +204,10 @@ def _ratios(case: Case) -> tuple[float, float]:
     return case.smallest["SFM"]["fixed"] / noise, case.smallest["SFM, β = 0"]["fixed"] / noise
 
 
-def _multiple(multiple: float) -> str:
+def _word(multiple: float) -> str:
     if multiple == 0.0:
         return "–"
-    return f"{multiple:.3g}" if multiple < 1000.0 else f"{multiple:.0f}"
-
-
-def _left(row: np.ndarray) -> tuple[str, str]:
-    return f"{row[0]:.1%}".replace("%", " %"), f"{row[1]:.3f}"
+    return f"{multiple:.2g}" if multiple < 1.0 else f"{multiple:.3g}" if multiple < 1000.0 else f"{multiple:.0f}"
 
 
 if __name__ == "__main__":
