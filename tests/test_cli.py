@@ -74,6 +74,21 @@ def test_render_overrides(folder):
     assert np.load("a.npy")[8, 12, :3].tolist() == pytest.approx([1.0, 0.25, 0.25], abs=0.3)
 
 
+def test_set_moves_objects_and_the_camera(folder):
+    """Poses given by --set, in any order, are those of `render`'s parameters."""
+    from warpfrag.capture.render import render
+    from warpfrag.scene.files import load_scene
+
+    poses = {"camera.rotation": (1, -2, 5), "camera.translation": (0.05, 0, 0.1), "ball.translation": (0, 0.1, 0)}
+    words = [f"--set={name}={','.join(map(str, value))}" for name, value in poses.items()]
+    assert main(["render", "scene.toml", "-o", "a.npy", *words]) == 0
+    expected = render(load_scene("scene.toml"), parameters=poses)
+    # World coordinates are rounded in other places: a pixel on an edge may change.
+    differ = np.abs(np.load("a.npy") - expected).max(axis=2) > 1e-4
+    assert differ.mean() < 0.01
+    assert np.abs(expected - render(load_scene("scene.toml"))).max() > 0.1
+
+
 MISTAKES = [
     (["rendr"], "No such command 'rendr'"),
     (["render", "scene.toml"], "Missing option"),
@@ -92,6 +107,8 @@ MISTAKES = [
     (["render", "scene.toml", "-o", "a.png", "--set", "beta"], "expected NAME=VALUE"),
     (["render", "scene.toml", "-o", "a.png", "--set", "bal.opacity=1"], 'did you mean "ball.opacity"?'),
     (["render", "scene.toml", "-o", "a.png", "--set", "ball.opacity=2"], "ball.opacity: found 2"),
+    (["render", "scene.toml", "-o", "a.png", "--set", "ball.rotation=1,2"], "expected x,y,z"),
+    (["render", "scene.toml", "-o", "a.png", "--set", "camera.rotation=0,nan,0"], "expected 3 finite numbers"),
     (["fit", "none.toml"], "none.toml: found no such file"),
     (["fit", "study.toml", "--steps", "0"], "steps: found 0"),
     (["fit", "study.toml", "--resume"], "found no checkpoint to resume"),

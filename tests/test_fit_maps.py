@@ -89,7 +89,7 @@ def test_a_map_of_beta_is_found():
     fragments = wf.capture(scene)
     # Only where fragments merge does beta matter.
     matters = np.abs(wf.composite(fragments, 0.1) - wf.composite(fragments, 0.9)).max(axis=2) > 0.02
-    assert matters.sum() > 100
+    assert matters.sum() > 60
     assert np.abs(result.found["beta"] - ramp)[matters].mean() < 0.03
     assert result.relative_errors()["beta"] >= 0.0
 

@@ -175,6 +175,10 @@ COMPLAINTS = {
     "matrix flat": (CAMERA + BALL + f"matrix = {[[1, 0, 0, 0]] * 3 + [[0, 0, 0, 1]]}\n", "matrix.*invertible"),
     "matrix too": (CAMERA + BALL + f"scale = 1\nmatrix = {np.eye(4).tolist()}\n", "matrix.*found scale as well"),
     "same name": (CAMERA + BALL + BALL, r'object\[1\].name: found "ball", which object\[0\] has too'),
+    "camera name": (
+        CAMERA + '[[object]]\nname = "camera"\nprimitive = "cube"\n',
+        r'object\[0\].name: found "camera", expected another',
+    ),
     "blank name": (CAMERA + '[[object]]\nname = ""\nprimitive = "cube"\n', "name.*not blank"),
     "normals": (CAMERA + BALL + 'normals = "smoth"\n', "normals.*did you mean"),
     "no mesh": (CAMERA + '[[object]]\nmesh = "trii.obj"\n', r'mesh: found no such file at .*did you mean "tri.obj"'),

@@ -10,7 +10,7 @@ many rows as there are columns, without squaring the condition number: an evalua
 few hundred bytes, and processes exchange no more.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -29,6 +29,8 @@ from warpfrag.scene.pose import pose_matrix
 
 wp.set_module_options({"enable_backward": False})
 
+# A QR decomposition of so many rows at a time stays in the cache: four to seven times as fast as all at once.
+QR_ROWS = 512
 # Columns of the table of objects: where a derivative goes, −1 for nowhere.
 _THICKNESS, _OPACITY, _COLOR = 0, 1, 2
 
@@ -257,12 +259,23 @@ class Evaluation:
         triangle = np.zeros((self.size + 1, self.size + 1))
         for view in self.views:
             for weight, rows in view.blocks():
-                scaled = rows * np.sqrt(weight / len(self.problem.views))
-                triangle = np.asarray(np.linalg.qr(np.concatenate([triangle, scaled]), mode="r"))
+                triangle = _triangle([triangle, _triangle([rows]) * np.sqrt(weight / len(self.problem.views))])
         parts = self.problem.processes.gather(triangle)
-        if len(parts) > 1:
-            triangle = np.asarray(np.linalg.qr(np.concatenate(parts), mode="r"))
-        return _compress(triangle, self.cost)
+        return _compress(_triangle(parts) if len(parts) > 1 else triangle, self.cost)
+
+
+def _triangle(parts: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the triangle R of a QR decomposition of rows, square."""
+    rows = np.concatenate(parts)
+    columns = rows.shape[1]
+    block = max(QR_ROWS, 2 * columns)
+    whole = len(rows) // block * block
+    if whole > block:
+        blocks = np.linalg.qr(rows[:whole].reshape(-1, block, columns), mode="r").reshape(-1, columns)
+        rows = np.concatenate([blocks, rows[whole:]])
+    # With at least as many rows as columns it is square.
+    padded = np.concatenate([rows, np.zeros((columns, columns))]) if len(rows) < columns else rows
+    return np.asarray(np.linalg.qr(padded, mode="r"))
 
 
 def _compress(triangle: np.ndarray, cost: float) -> Compressed:

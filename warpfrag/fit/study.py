@@ -119,7 +119,7 @@ class Study:
 
     scene: Scene
     reference: Reference | None
-    parameters: Mapping[str, FitParameter]
+    parameters: Mapping[str, Any]
     views: Sequence[View] = ()
     loss: str | Mapping[str, float] = "l2"
     delta: float = 0.1
@@ -191,13 +191,17 @@ class Study:
             return None
         result = {}
         scene, true = in_multiples_of_p(self.scene, reference.true, "reference.true")
+        # Rendered in another way, the scene's own values are not what a fit is to find.
+        alike = reference.supersampling == 1 and all(
+            getattr(reference, key) in (None, getattr(self.scene, key)) for key in RENDER_OPTIONS
+        )
         for variable in self.variables:
             name = variable.name
             value = true.get(name, scene_value(scene, name))
             other = variable.key == "thickness" and thickness_units(scene, name) != thickness_units(
                 self.fitted_scene, name
             )
-            if value is None or other:
+            if value is None or other or not (alike or name in true):
                 return None
             result[name] = np.asarray(value, dtype=np.float64)
         return result

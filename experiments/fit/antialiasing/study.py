@@ -173,16 +173,16 @@ def fit_all(scene: wf.Scene, thickness: float) -> dict[str, FitResult]:
     names = [f"{item.name}.thickness" for item in scene.objects]
     reference = Reference(true={}, supersampling=SAMPLES, merge="none")
     results: dict[str, FitResult] = {}
-    for kind, given in {"scene": ["thickness"], "object": names}.items():
+    for kind, fitted in {"scene": ["thickness"], "object": names}.items():
         ends = []
         for beta in START_BETAS:
-            ends.append(wf.fit(Study(scene, reference, {"beta": beta, **dict.fromkeys(given, thickness)})))
+            ends.append(wf.fit(Study(scene, reference, {"beta": beta, **dict.fromkeys(fitted, thickness)})))
             reference = Reference(image=ends[0].reference)
         results[kind] = min(ends, key=lambda end: end.loss)
     maps = {name: FitParameter(thickness, per="pixel") for name in names}
-    given = {"beta": START_BETAS[0], **maps}
     options: dict[str, Any] = {"method": "adam", "steps": STEPS, "learning_rate": LEARNING_RATE, "tolerance": 0.0}
-    return {**results, "pixel": wf.fit(Study(scene, reference, given, **options))}
+    many = Study(scene, reference, {"beta": START_BETAS[0], **maps}, **options)
+    return {**results, "pixel": wf.fit(many)}
 
 
 def best_factor(some: Sequence[Case], footprint: str, beta: float = 1.0) -> float:
@@ -240,7 +240,7 @@ def summarise(size: int, all_cases: list[Case], factors: dict[str, float], best:
 
     def psnrs(mask: str | None, caption: str) -> Table:
         rows = tuple(
-            (case.title, *(f"{case.psnr(case.images[m], mask and getattr(case, mask)):.1f}" for m in METHODS))
+            (case.title, *(f"{case.psnr(case.images[m], getattr(case, mask) if mask else None):.1f}" for m in METHODS))
             for case in all_cases
         )
         return Table(("", *METHODS.values()), rows, caption)
@@ -266,23 +266,22 @@ def summarise(size: int, all_cases: list[Case], factors: dict[str, float], best:
         own_factors = [best_factor([case], RULE, beta) for case in fitted]
         levels = [c.psnr(c.by_rule(RULE, f, beta), c.band) for c, f in zip(fitted, own_factors, strict=True)]
         betas.append((f"{beta:g}", *(f"{v:.1f} ({f:.2f})" for v, f in zip(levels, own_factors, strict=True))))
-    none, pixel, one, rule = (
-        mean(others, lambda c, m=m: c.images[m]) for m in ("none", "pixel size", "global", "rule")
-    )
+    shown = ("none", "pixel size", "global", "rule")
+    none, pixel, fitted_there, rule = (mean(others, lambda c, m=m: c.images[m]) for m in shown)
     low, middle, high = quartiles(best, RULE)
     answer = (
         f"t = {factors[RULE]:.2f}·|g₁ − g₂| for both surfaces, where g is the gradient of a surface's depth along the "
         f"ray from pixel to pixel: the length of the *difference* of the two footprints, neither the pixel size nor "
         f"either surface's own. Searched pixel by pixel, t/|g₁ − g₂| has median {middle:.2f} and quartiles {low:.2f} "
         f"and {high:.2f}. Carried over to another view, resolution and scene, the rule reaches {rule:.1f} dB in the "
-        f"band around intersections (mean of {len(others)} images), against {one:.1f} with one thickness fitted to "
-        f"each of them, {pixel:.1f} with the pixel size and {none:.1f} unmerged."
+        f"band around intersections (mean of {len(others)} images), against {fitted_there:.1f} with one thickness "
+        f"fitted to each of them, {pixel:.1f} with the pixel size and {none:.1f} unmerged."
     )
     numbers = {
         "factor": factors[RULE],
         "median ratio": middle,
         "carried over [dB]": rule,
-        "global, fitted there [dB]": one,
+        "global, fitted there [dB]": fitted_there,
         "pixel size [dB]": pixel,
         "none [dB]": none,
     }

@@ -85,6 +85,8 @@ def pen_line(samples: int = 12) -> np.ndarray:
     before, here, after, later = (np.roll(points, shift, axis=0)[:, None] for shift in (1, 0, -1, -2))
     s = np.linspace(0.0, 1.0, samples, endpoint=False)[:, None]
     curve = here + 0.5 * s * (
-        after - before + s * (2.0 * before - 5.0 * here + 4.0 * after - later + s * (3.0 * (here - after) + later - before))
+        after
+        - before
+        + s * (2.0 * before - 5.0 * here + 4.0 * after - later + s * (3.0 * (here - after) + later - before))
     )
     return curve.reshape(-1, 2)

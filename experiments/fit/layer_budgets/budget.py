@@ -111,17 +111,23 @@ class Case:
         return {"image": squares[:, -1], "inserted": squares[:, :-1].mean(axis=1)}
 
     def scores(self, method: str, layer_count: int, thickness: Any) -> dict[str, dict[str, float]]:
-        """Return by measure how far layers are from all fragments, where there are any [levels of 255, linear light].
+        """Return by measure how far layers are from all fragments, see `score`."""
+        differences = self.differences(method, layer_count, thickness)
+        return {"image": self.score(differences[:, -1:]), "inserted": self.score(differences[:, :-1])}
 
-        By each measure "rms", "mean" and "p99", the latter two of the absolute difference of a pixel's channels.
+    def score(self, differences: Any) -> dict[str, float]:
+        """Return what differences of images amount to where there are fragments [levels of 255, linear light].
+
+        Args:
+            differences: of any number of images, (P, images, 3).
+
+        Returns:
+            "rms", and "mean" and "p99" of the absolute difference, the mean of the channels.
         """
-        differences = LEVELS * self.differences(method, layer_count, thickness)[self.covered].double().numpy()
-        result = {}
-        for measure, part in zip(MEASURES, (differences[:, -1:], differences[:, :-1]), strict=True):
-            apart = np.abs(part).mean(axis=2)
-            rms = float(np.sqrt(np.square(part).mean()))
-            result[measure] = {"rms": rms, "mean": float(apart.mean()), "p99": float(np.percentile(apart, 99.0))}
-        return result
+        levels = LEVELS * differences[self.covered].double().numpy()
+        apart = np.abs(levels).mean(axis=2)
+        rms = float(np.sqrt(np.square(levels).mean()))
+        return {"rms": rms, "mean": float(apart.mean()), "p99": float(np.percentile(apart, 99.0))}
 
     def rms(self, squares: np.ndarray) -> float:
         """Return the root of the mean of squares (P,) where there are fragments [levels of 255]."""
@@ -140,7 +146,11 @@ def with_surface(layers: wf.Layers, distances: np.ndarray, background: tuple[flo
         Linear colour by distance, and last without the surface, (P, D + 1, 3).
     """
     most = layers.max_layers
-    rgba, depth, thickness = layers.rgba.reshape(-1, most, 4), layers.depth.view(-1, most), layers.thickness.view(-1, most)
+    rgba, depth, thickness = (
+        layers.rgba.reshape(-1, most, 4),
+        layers.depth.view(-1, most),
+        layers.thickness.view(-1, most),
+    )
     behind = torch.tensor(background[:3])
     length = thickness.clamp_min(1e-12)
     images = []

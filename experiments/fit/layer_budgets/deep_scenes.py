@@ -30,13 +30,13 @@ def assembly(size: int) -> wf.Scene:
 def hair_ball(size: int) -> wf.Scene:
     """Return a ball of curly hair."""
     camera = wf.Camera((0.0, 0.0, 3.6), (0.0, 0.0, 0.0), fov=33.0, size=(size, size))
-    return _scene(camera, shapes.hair_ball(strands=4000, segments=12, width=0.05), 0.15)
+    return _scene(camera, shapes.hair_ball(strands=4000, segments=12, width=0.05), 0.2)
 
 
 def floor(size: int) -> wf.Scene:
     """Return a floor with boxes and balls on it, of points drawn as large surfels."""
     camera = wf.Camera((-3.7, 1.35, 1.5), (-0.05, 0.05, 0.05), fov=36.0, size=(size, size))
-    return _scene(camera, surfels(shapes.floor_points(6000), radius=3.2), 0.15)
+    return _scene(camera, surfels(shapes.floor_points(6000), radius=3.2), 0.2)
 
 
 def _scene(camera: wf.Camera, mesh: Mesh, opacity: float) -> wf.Scene:

@@ -102,7 +102,7 @@ def descend(case: Case, method: str, layer_count: int, start: float, steps: int)
         gradient: Any = logarithm.grad
         if step == 0:
             moved = float((gradient.numpy()[case.covered] != 0.0).mean())
-        if float(loss) < least:
-            least, best = float(loss), logarithm.detach().exp().numpy().copy()
+        if loss.item() < least:
+            least, best = loss.item(), logarithm.detach().exp().numpy().copy()
         optimizer.step()
     return Descent(best, moved)

@@ -64,7 +64,7 @@ def main() -> None:
     factor = json.loads((ANTIALIASING / "numbers.json").read_text())["factor"]
     images = {"none": wf.render(scene, merge="none"), "rule": by_rule(scene, factor)}
     curves = figures.by_thickness(scene, references, band)
-    figures.comparison(compared, curves, fits).savefig(HERE / "figures" / "comparison.png", dpi=150)
+    figures.comparison(compared, curves).savefig(HERE / "figures" / "comparison.png", dpi=150)
     summarise(compared, references, fits, images, band, factor).save(HERE)
 
 
@@ -128,11 +128,11 @@ def summarise(
     moved = int((255.0 * pair.residual[~pair.crossing] > 1.0).sum())
     size, total = pair.crossing.shape, pair.crossing.size * SAMPLES**2
     answer = (
-        f"From the same sample positions {int(pair.differing.sum())} of {total:,} samples differ: OpenGL rounds projected "
-        f"vertices to 1/256 of a sample. One sample of 64 is up to 4/255, so {moved} pixels outside intersections differ "
-        f"by more than 1/255. With the vertices on that grid for both renderers the residual outside intersections is "
-        f"{outside:.4f}/255 at most. Fits to pyrender's image and to ours find the same β and thickness, to "
-        f"{100.0 * max(apart):.2g} %."
+        f"From the same sample positions {int(pair.differing.sum())} of {total:,} samples differ: OpenGL rounds "
+        f"projected vertices to 1/256 of a sample. One sample of 64 is up to 4/255, so {moved} pixels outside "
+        f"intersections differ by more than 1/255. With the vertices on that grid for both renderers the residual "
+        f"outside intersections is {outside:.4f}/255 at most. Fits to pyrender's image and to ours find the same β and "
+        f"thickness, to {100.0 * max(apart):.2g} %."
     )
     numbers = {
         "residual outside intersections [1/255]": outside,
