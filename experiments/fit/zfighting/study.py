@@ -138,6 +138,11 @@ def report(data: dict[str, Any]) -> None:
         f"their order by noise / thickness, which falls below 1/255 only at {least:.0f} to {most:.0f} times the noise."
     )
     needed = next(case.smallest["SFM"]["eye"] for case in depth if case.setting.z == FITTED_DEPTH)
+    finer = [case.smallest["OFM"]["rasteriser"] for case in data["bits"]]
+    bits = (
+        f"With {', '.join(map(str, BITS))} bits of z-buffer and of P(z), z = 10 near, it is "
+        f"{', '.join(f'{multiple:.1f}' for multiple in finer)} P(z) after a rasteriser: its own rounding stays."
+    )
     fitted = (
         f"`study.toml` fits the thickness, from 2 P(z), to an even mix of two planes at z = {FITTED_DEPTH:g} near, "
         f"where a third one 200 P(z) before them must stay apart: {found['multiple']:.0f} P(z), as thick as the gap "
@@ -176,6 +181,7 @@ def report(data: dict[str, Any]) -> None:
         **{f"rasterised, OFM, tilt {c.setting.tilt:g}": c.smallest["OFM"]["rasteriser"] for c in tilt},
         **{f"warpfrag, SFM, z = {c.setting.z:g}": c.smallest["SFM"]["eye"] for c in depth},
         **{f"SFM / OFM, opacity {opacity:g}": pair[0] for opacity, pair in ratios.items()},
+        **{f"rasterised, OFM, {count} bits": multiple for count, multiple in zip(BITS, finer, strict=True)},
         "rule, P": storage,
         "rule, P if rasterised": projection,
         "rule, p / 256": corners,
@@ -188,7 +194,7 @@ def report(data: dict[str, Any]) -> None:
         name="zfighting",
         title="z-fighting",
         question="How many P(z) thick must slabs be for coplanar planes not to speckle?",
-        answer=f"{answer}\n\n{fitted}",
+        answer=f"{answer}\n\n{bits} {fitted}",
         tables=tables,
         figures=(
             Figure("figures/speckle.png", "Coplanar planes at z = 10 near, as two depth buffers leave them"),
