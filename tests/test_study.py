@@ -1,5 +1,7 @@
 """Study files: what they mean, and the one line each mistake gets."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from small_scene import spheres
@@ -188,3 +190,17 @@ def test_nothing_to_fit():
         Study(spheres(), Reference(), {"beta": 0.5})
     with pytest.raises(StudyError, match="options of a render"):
         Study(spheres(), Reference(image=np.zeros((36, 40, 3)), supersampling=2), {"beta": 0.5})
+
+
+def test_one_value_may_be_asked_for(folder):
+    """Per object, a number stays a number."""
+    study = load(folder, STUDY)
+    variables = replace(study, parameters={"beta": FitParameter(0.5, per="object")}).variables
+    assert variables[0].start.shape == ()
+
+
+def test_true_values_are_those_of_the_same_kind_of_render(folder):
+    """A reference merged in another way was not made by what a fit is to find."""
+    study = load(folder, STUDY)
+    assert study.true is not None
+    assert replace(study, reference=replace(study.reference, merge="none")).true is None

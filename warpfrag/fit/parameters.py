@@ -314,7 +314,7 @@ def _start(
     stacked = parameter.per == "view" or len(shape) == 3
     if value.shape not in (shape, shape[1:] if stacked else shape, next(iter(shapes.values()))):
         raise ValueError(f"{where}.start: found shape {value.shape}, expected shape {shape}")
-    return np.ascontiguousarray(np.broadcast_to(value, shape)), parameter.per
+    return np.broadcast_to(value, shape).copy(), parameter.per
 
 
 def _shapes(scene: Scene, cameras: Sequence[Camera], name: str, key: str) -> dict[Per, tuple[int, ...]]:

@@ -191,17 +191,16 @@ class Study:
             return None
         result = {}
         scene, true = in_multiples_of_p(self.scene, reference.true, "reference.true")
-        # Rendered in another way, the scene's own values are not what a fit is to find.
-        alike = reference.supersampling == 1 and all(
-            getattr(reference, key) in (None, getattr(self.scene, key)) for key in RENDER_OPTIONS
-        )
+        # What a render of another kind was made with is not what a fit is to find.
+        if any(getattr(reference, key) not in (None, getattr(self.scene, key)) for key in RENDER_OPTIONS):
+            return None
         for variable in self.variables:
             name = variable.name
             value = true.get(name, scene_value(scene, name))
             other = variable.key == "thickness" and thickness_units(scene, name) != thickness_units(
                 self.fitted_scene, name
             )
-            if value is None or other or not (alike or name in true):
+            if value is None or other:
                 return None
             result[name] = np.asarray(value, dtype=np.float64)
         return result
