@@ -101,7 +101,7 @@ class ViewEvaluation:
         # A scene that is out of sight has no fragments to differentiate by.
         keys = keys if self.unit.fragments.count else set()
         self.fragments = self.unit.scaled(self.values, self.variables)
-        device = problem.study.device
+        device = problem.device
         # Beta as one value per pixel, so that its gradient stays apart by pixel.
         beta = np.full(problem.scene.camera.shape, self.values.get("beta", problem.scene.beta), np.float32)
         moves = problem.moves and bool(keys)

@@ -34,10 +34,11 @@ class ViewProblem:
         study: the study.
         view: the view.
         index: its place among the fitted views; 0 for one that is held out, for which no value is stacked.
+        device: where to compute.
     """
 
-    def __init__(self, study: Study, view: View, index: int) -> None:
-        self.study, self.view, self.index = study, view, index
+    def __init__(self, study: Study, view: View, index: int, device: str) -> None:
+        self.study, self.view, self.index, self.device = study, view, index, device
         self.scene = replace(study.fitted_scene, camera=view.camera)
         self.moves = any(variable.moves for variable in study.variables)
         self.reference = reference_image(study, view, index)
@@ -105,8 +106,9 @@ class Problem:
     def __init__(self, study: Study, processes: Processes | None = None) -> None:
         self.study, self.processes = study, processes or Processes(study.device)
         fitted = study.fitted_views
-        self.views = [ViewProblem(study, view, index) for index, view in enumerate(fitted)]
-        self.held_out = [ViewProblem(study, view, 0) for view in study.all_views if view.held_out]
+        device = self.processes.device
+        self.views = [ViewProblem(study, view, index, device) for index, view in enumerate(fitted)]
+        self.held_out = [ViewProblem(study, view, 0, device) for view in study.all_views if view.held_out]
 
     def values(self, coordinates: np.ndarray) -> dict[str, np.ndarray]:
         """Return the parameters for a vector of a method's coordinates."""
