@@ -17,10 +17,18 @@ import warpfrag as wf
 
 METHODS = ("SFM", "exact", "SKB+OFM")
 MEASURES = ("image", "inserted")
+# What there is something to choose for. Without a surface inserted, methods that sort want no thickness at all.
+OPEN = (*((method, "inserted") for method in METHODS), ("SKB+OFM", "image"))
+# Numbers of layers.
+BUDGETS = (2, 4, 8)
 BETA = 1.0
 # Distances that the surface is put at, evenly between the nearest and the farthest fragment of the scene.
 DISTANCE_COUNT = 8
 LEVELS = 255.0
+# What a slab must be longer than a gap to bridge it, as a share of the depth: a few times the rounding of float32.
+ROUNDING = 2.0**-21
+# Method, measure and number of layers.
+Key = tuple[str, str, int]
 
 
 @dataclass(eq=False)
@@ -71,10 +79,32 @@ class Case:
         return extent
 
     @cached_property
+    def gaps(self) -> np.ndarray:
+        """Gaps between successive fragments of each pixel, the largest first, then 0 [scene units], (P, G)."""
+        first = self.fragments[True].offsets.numpy()[:-1]
+        owner = self.owner.numpy()
+        place = np.arange(len(owner)) - first[owner]
+        depth = np.full((len(self.counts), int(self.counts.max())), np.nan)
+        depth[owner, place] = self.fragments[True].depth.numpy()
+        return -np.sort(-np.nan_to_num(np.diff(depth, axis=1)), axis=1)
+
+    def gap(self, rank: int) -> np.ndarray:
+        """Return the thickness that bridges a pixel's gap of this rank and all smaller ones [scene units], (P,)."""
+        if rank > self.gaps.shape[1]:
+            return np.full(len(self.counts), ROUNDING * self.span[1])
+        # Slabs that only touch do not overlap.
+        return self.gaps[:, rank - 1] + ROUNDING * self.span[1]
+
+    @cached_property
     def span(self) -> tuple[float, float]:
         """Distances of the nearest and the farthest fragment [scene units]."""
         depth = self.fragments[True].depth
         return float(depth.min()), float(depth.max())
+
+    @property
+    def resolution(self) -> float:
+        """Mean P(z) of the fragments [scene units]."""
+        return float(self.fragments[True].thickness.mean())
 
     @property
     def distances(self) -> np.ndarray:

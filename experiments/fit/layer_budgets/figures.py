@@ -4,8 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from budget import METHODS
-from maps import BLOCK, RULES, by_rule
+from maps import BLOCK, RULES
 from matplotlib import rc_context
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
@@ -18,7 +17,7 @@ LINES = {
     "2P": ("t = 2P", "#9e9e9e", "o-"),
     "100P": ("t = 100P", "#616161", "s-"),
     "one value": ("one value, fitted", "#1f78b4", "^-"),
-    "gradient": ("map, by gradient from there", "#6a3d9a", "v:"),
+    "gradient": ("map, by gradient", "#6a3d9a", "v:"),
     RULES[0]: ("rule, factor of the machine", "#e31a1c", "D-"),
     "blocks": (f"map, {BLOCK}² blocks", "#33a02c", "P--"),
     "pixels": ("best possible per pixel", "#000000", "*--"),
@@ -31,7 +30,7 @@ SHOWN = {
     "one value": "one value, fitted",
     RULES[0]: "rule",
     "blocks": f"map, {BLOCK}² blocks",
-    "pixels": "best possible\nper pixel",
+    "pixels": "best possible per pixel",
 }
 LAYERS = 4
 
@@ -70,29 +69,29 @@ def errors(measured: Sequence[Any], budgets: Sequence[int]) -> Figure:
 def images(found: Any) -> Figure:
     """Draw images of four layers by several thicknesses, and where they are off."""
     case = found.case
-    middle = len(case.distances) // 2
-    rows = (("SKB+OFM", "image", -1), ("SFM", "inserted", middle))
+    rows = (("SKB+OFM", "image", -1, 15.0), ("SFM", "inserted", len(case.distances) // 2, 40.0))
     with rc_context(STYLE):
-        figure = Figure(figsize=(13.0, 8.2), layout="constrained")
+        figure = Figure(figsize=(13.0, 7.2), layout="constrained")
         axes = figure.subplots(2 * len(rows), 1 + len(SHOWN))
-        for number, (method, measure, view) in enumerate(rows):
-            key = method, measure, LAYERS
+        for number, (method, measure, view, most) in enumerate(rows):
             top, bottom = axes[2 * number], axes[2 * number + 1]
             reference = case.reference[:, view]
-            top[0].imshow(_displayed(case, reference), interpolation="nearest")
+            top[0].imshow(_cropped(case, _displayed(case, reference)), interpolation="nearest")
             top[0].set_title("all fragments")
             words = "the image" if view < 0 else f"a surface inserted\nat distance {case.distances[view]:.1f}"
             top[0].set_ylabel(f"{method}, M = {LAYERS}:\n{words}")
             bottom[0].set_visible(False)
             for column, (way, label) in enumerate(SHOWN.items(), start=1):
-                difference = case.differences(method, LAYERS, found.choices[key][way])[:, view]
-                top[column].imshow(_displayed(case, reference + difference), interpolation="nearest")
+                difference = case.differences(method, LAYERS, found.choices[method, measure, LAYERS][way])[:, view]
+                image = _displayed(case, reference + difference)
+                top[column].imshow(_cropped(case, image), interpolation="nearest")
                 top[column].set_title(label)
-                apart = 255.0 * difference.abs().mean(dim=1).numpy().reshape(case.scene.camera.shape)
+                apart = 255.0 * difference.abs().mean(dim=1).numpy()
                 shown = bottom[column].imshow(
-                    apart, cmap="inferno", vmin=0.0, vmax=15.0 if view < 0 else 40.0, interpolation="nearest"
-                )
-                bottom[column].set_xlabel(f"mean {apart.reshape(-1)[case.covered].mean():.2f}")
+                    _cropped(case, apart.reshape(case.scene.camera.shape)),
+                    cmap="inferno", vmin=0.0, vmax=most, interpolation="nearest",
+                )  # fmt: skip
+                bottom[column].set_xlabel(f"mean {apart[case.covered].mean():.2f}")
             bar = figure.colorbar(shown, ax=bottom, location="right", shrink=0.9, pad=0.01, extend="max")
             bar.set_label("|error| [levels of 255]")
         for axis in axes.flat:
@@ -113,7 +112,7 @@ def maps(found: Any) -> Figure:
     }
     shape = case.scene.camera.shape
     with rc_context(STYLE):
-        figure = Figure(figsize=(13.0, 2.9), layout="constrained")
+        figure = Figure(figsize=(13.0, 3.0), layout="constrained")
         axes = figure.subplots(1, 2 + len(panels))
         counts = np.where(case.covered, case.counts, np.nan).reshape(shape)
         extent = np.where(case.covered, case.extent, np.nan).reshape(shape)
@@ -121,13 +120,13 @@ def maps(found: Any) -> Figure:
             (axes[0], counts, "fragments", "n"),
             (axes[1], extent, "extent in depth", "[scene units]"),
         ):
-            shown = axis.imshow(values, cmap="viridis", interpolation="nearest")
+            shown = axis.imshow(_cropped(case, values), cmap="viridis", interpolation="nearest")
             axis.set_title(title)
             figure.colorbar(shown, ax=axis, location="bottom", shrink=0.9, label=label)
         norm = LogNorm(1e-3, 1.0)
         for axis, (title, values) in zip(axes[2:], panels.items(), strict=True):
             map = np.where(case.covered, np.maximum(values, 1e-9), np.nan).reshape(shape)
-            shown = axis.imshow(map, cmap="magma", norm=norm, interpolation="nearest")
+            shown = axis.imshow(_cropped(case, map), cmap="magma", norm=norm, interpolation="nearest")
             axis.set_title(title)
         figure.colorbar(
             shown, ax=list(axes[2:]), location="bottom", shrink=0.6, extend="both", aspect=50,
@@ -137,6 +136,13 @@ def maps(found: Any) -> Figure:
             axis.set(xticks=[], yticks=[])
             axis.spines[:].set_visible(False)
     return figure
+
+
+def _cropped(case: Any, image: np.ndarray) -> np.ndarray:
+    """Return the part of an image that has fragments, with a margin."""
+    covered = case.covered.reshape(case.scene.camera.shape)
+    (rows,), (columns,) = np.nonzero(covered.any(axis=1)), np.nonzero(covered.any(axis=0))
+    return image[max(rows[0] - 2, 0) : rows[-1] + 3, max(columns[0] - 2, 0) : columns[-1] + 3]
 
 
 def _displayed(case: Any, image: Any) -> np.ndarray:

@@ -18,7 +18,8 @@ GRID = np.concatenate([[0.0], np.geomspace(1e-4, 0.7, 27)])
 FACTORS = np.geomspace(0.06, 1.0, 12)
 # Edge of the blocks of pixels [pixels].
 BLOCK = 8
-RULES = ("extent (1/M − 1/n)", "extent / M")
+# The rule, and what it is without its bound.
+RULES = ("min(c·extent/M, gap)", "c·extent/M")
 # Of Adam, in the logarithm of the thickness.
 LEARNING_RATE = 0.1
 
@@ -65,16 +66,17 @@ class Search:
 def by_rule(case: Case, layer_count: int, factor: float, rule: str = RULES[0]) -> np.ndarray:
     """Return the thickness that a pixel's complexity asks for [scene units], (P,): 0 where all fragments find room.
 
+    That is a share of the pixel's extent in depth, but no more than merges its fragments into M layers: the M-th
+    largest gap between two that follow one another.
+
     Args:
-        case: the scene: numbers of fragments n, extents.
+        case: the scene.
         layer_count: number of layers M.
-        factor: what the rule is multiplied by.
+        factor: c, the share for M = 1.
         rule: one of `RULES`.
     """
-    share = 1.0 / layer_count
-    if rule == RULES[0]:
-        share = share - 1.0 / np.maximum(case.counts, 1)
-    return np.where(case.counts > layer_count, factor * case.extent * share, 0.0)
+    thickness = np.where(case.counts > layer_count, factor * case.extent / layer_count, 0.0)
+    return np.minimum(thickness, case.gap(layer_count)) if rule == RULES[0] else thickness
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,11 +84,13 @@ class Descent:
     """What Adam has found.
 
     Attributes:
-        thickness: the map of the least loss [scene units], (P,).
+        pixels: the thickness with which each pixel was best on its way [scene units], (P,).
+        together: the map of the step that was best for all pixels together [scene units], (P,).
         moved: share of the pixels with fragments whose first gradient is not 0.
     """
 
-    thickness: np.ndarray
+    pixels: np.ndarray
+    together: np.ndarray
     moved: float
 
 
@@ -94,15 +98,19 @@ def descend(case: Case, method: str, layer_count: int, start: float, steps: int)
     """Fit a map by the gradient of the error with a surface inserted, from one value for all pixels [scene units]."""
     logarithm = torch.full((len(case.counts),), float(np.log(start)), dtype=torch.float64, requires_grad=True)
     optimizer = torch.optim.Adam([logarithm], lr=LEARNING_RATE)
-    least, best, moved = np.inf, np.full(len(case.counts), start), 0.0
+    least, together, moved = np.inf, np.full(len(case.counts), start), 0.0
+    squares, pixels = np.full(len(case.counts), np.inf), together
     for step in range(steps + 1):
         optimizer.zero_grad()
-        loss = case.differences(method, layer_count, logarithm.exp())[:, :-1].square().mean(dim=(1, 2)).sum()
+        losses = case.differences(method, layer_count, logarithm.exp())[:, :-1].square().mean(dim=(1, 2))
+        loss = losses.sum()
         loss.backward()
         gradient: Any = logarithm.grad
         if step == 0:
             moved = float((gradient.numpy()[case.covered] != 0.0).mean())
+        here, now = logarithm.detach().exp().numpy(), losses.detach().numpy()
         if loss.item() < least:
-            least, best = loss.item(), logarithm.detach().exp().numpy().copy()
+            least, together = loss.item(), here
+        pixels, squares = np.where(now < squares, here, pixels), np.minimum(now, squares)
         optimizer.step()
-    return Descent(best, moved)
+    return Descent(pixels, together, moved)

@@ -1,11 +1,11 @@
 """Fits from random starts under a budget of renders, which go on until one has arrived.
 
-References are renders of the model that is fitted: at the true values the loss is 0, so that a fit knows by its loss
-whether it has arrived, and starts anew where it has not. Cost is counted in renders (the images of all views): one for
-an image, and `PASS` for each pass back through it, one for a gradient and three, one a colour, for a Jacobian.
+References are renders of the model that is fitted: at the true values nothing is left of the difference, so that a fit
+knows whether it has arrived, and starts anew where it has not. Cost is counted in renders (the images of all views):
+one for an image, and `PASS` for each pass back through it, one pass for a gradient, one a colour for a Jacobian.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -21,21 +21,54 @@ from warpfrag.fit.outcome import SMALLEST_NOISE, assess
 from warpfrag.fit.problem import Problem, ViewProblem
 from warpfrag.fit.session import Progress, Session
 
-# What a pass back costs [renders]: measured, 2.1 for a gradient and 5.7 for a Jacobian's three at 40².
+# What a pass back costs [renders]: measured at 40², 1 thread: 2.1 for a gradient, 5.7 for the three of a Jacobian.
 PASS = 2
-# True betas, and thicknesses as shares of the scene's depth, the latter log-uniform; starts are drawn alike.
+COLORS = 3
+# True betas are uniform, thicknesses log-uniform between these shares of the scene's depth; starts are drawn alike.
 BETAS = (0.05, 0.95)
-THICKNESSES = (0.02, 1.0)
-# Bounds of the fits are wider by this factor.
+THICKNESSES = (0.05, 1.0)
+# Bounds of fitted thicknesses are wider by this factor.
 ROOM = 4.0
-# A fit has arrived when the root mean square of image minus reference is that of float32's rounding.
-ARRIVED = SMALLEST_NOISE**2
-# Recovered: every parameter that the image determines is as near as this, relative to the truth.
+# A fit has arrived when the root mean square of image minus reference is below float32's spacing.
+ARRIVED = 2.0**-23
+# Recovered: every identifiable parameter is as near as this, relative to the truth.
 RECOVERED = 0.01
+# More steps than any budget has.
+UNLIMITED = 10**6
 
 
-class Enough(Exception):
-    """The fit has arrived, or its budget is spent."""
+class BudgetError(Exception):
+    """A fit has spent all renders that it may."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """A way of fitting.
+
+    Attributes:
+        name: what tables call it.
+        kind: the method of a study, or "cma".
+        stages: options of the study, of fits each of which starts where the one before has ended.
+    """
+
+    name: str
+    kind: str
+    stages: tuple[dict[str, Any], ...]
+
+
+# Losses and learning rate: those of several that recovered most of a few draws.
+METHODS = {
+    # What is left of l1's rounding below 1e-3, where jumps count again, a smaller one takes out.
+    "robust": Method(
+        "least squares, l1",
+        "least_squares",
+        ({"loss": "l1", "steps": 40}, {"loss": "huber", "delta": 1e-5, "steps": 40}),
+    ),
+    "squares": Method("least squares, l2", "least_squares", ({"loss": "l2", "steps": 80},)),
+    "adam": Method("Adam, l1", "adam", ({"loss": "l1", "learning_rate": 0.1, "steps": UNLIMITED},)),
+    "lbfgs": Method("L-BFGS, l1", "lbfgs", ({"loss": "l1", "steps": UNLIMITED},)),
+    "cma": Method("CMA-ES, l1", "cma", ({"loss": "l1"},)),
+}
 
 
 class FrozenView(ViewProblem):
@@ -50,53 +83,37 @@ class FrozenView(ViewProblem):
             import torch
 
             unit = self.unit.fragments.torch("cpu")
-            by_object = torch.stack([parameters[f"{name}.thickness"] for name in self.unit.names])
-            fragments = replace(unit, thickness=unit.thickness * by_object[torch.as_tensor(self.unit.objects).long()])
+            thickness = torch.stack([parameters[f"{name}.thickness"] for name in self.unit.names])
+            fragments = replace(unit, thickness=unit.thickness * thickness[torch.as_tensor(self.unit.objects).long()])
         return self.over_background(self.composite(fragments, parameters["beta"]))
-
-
-@dataclass(frozen=True)
-class Method:
-    """A way of fitting.
-
-    Attributes:
-        name: what the tables call it.
-        kind: of the study's method, or "cma".
-        stages: options of the study, of fits that start where the one before has ended.
-        passes: of a derivative.
-    """
-
-    name: str
-    kind: str
-    stages: tuple[dict[str, Any], ...]
-    passes: int = 1
-
-
-ROBUST = ({"loss": "l1", "steps": 40}, {"loss": "huber", "delta": 1e-5, "steps": 40})
-METHODS = {
-    "robust": Method("least squares, l1", "least_squares", ROBUST, 3),
-    "squares": Method("least squares, l2", "least_squares", ({"loss": "l2", "steps": 80},), 3),
-    "adam": Method("Adam", "adam", ({"loss": "l1", "steps": 10**6, "learning_rate": 0.05},)),
-    "lbfgs": Method("L-BFGS", "lbfgs", ({"loss": "l1", "steps": 10**6},)),
-    "cma": Method("CMA-ES", "cma", ({"loss": "l1"},)),
-}
 
 
 @dataclass
 class Meter:
-    """What a fit from all of its starts has cost, and the best it has found."""
+    """What a fit from one start may spend and has spent, and the best of its last stage."""
 
     budget: float
     images: int = 0
-    derivatives: int = 0
-    spent: float = 0.0
+    passes: int = 0
     cost: float = np.inf
     coordinates: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
-    def keep(self, cost: float, coordinates: np.ndarray) -> None:
-        """Keep the better end: of the mean of rho."""
+    @property
+    def spent(self) -> float:
+        """Renders spent."""
+        return self.images + PASS * self.passes
+
+    def record(self, images: int, passes: int, cost: float, coordinates: np.ndarray) -> None:
+        """Take note of what has been spent since, and of an end, if none before in this stage was better.
+
+        Raises:
+            BudgetError: nothing is left.
+        """
+        self.images, self.passes = images, passes
         if cost < self.cost:
             self.cost, self.coordinates = cost, coordinates
+        if self.spent >= self.budget:
+            raise BudgetError
 
 
 class Setting:
@@ -109,13 +126,13 @@ class Setting:
     """
 
     def __init__(self, case: Case, merge: str, size: int) -> None:
-        self.case, self.scene = case, case.scene(size, merge)
+        self.scene = case.scene(size, merge)
+        self.views = case.views(self.scene)
         self.names = ["beta", *(f"{item.name}.thickness" for item in self.scene.objects)]
         self.thinnest, self.thickest = (share * case.depth for share in THICKNESSES)
-        self.views = case.views(self.scene)
-        blank = [np.zeros((size, size, 4), np.float32)] * len(self.views)
-        study = self.study(dict.fromkeys(self.names, 0.5), blank)
-        self.frozen = [FrozenView(study, view, index) for index, view in enumerate(study.all_views)]
+        self.residual_count = 4 * size * size * len(self.views)
+        study = self.study(dict.fromkeys(self.names, 0.5), [np.zeros((size, size, 4), np.float32)] * len(self.views))
+        self.frozen = [FrozenView(study, view, index, study.device) for index, view in enumerate(study.all_views)]
 
     def draw(self, generator: np.random.Generator) -> dict[str, float]:
         """Draw parameter values."""
@@ -128,6 +145,11 @@ class Setting:
         arrays = {name: np.asarray(value) for name, value in values.items()}
         return [np.array(view.image(arrays)) for view in self.frozen]
 
+    def root_mean_square(self, values: dict[str, float], references: list[np.ndarray]) -> float:
+        """Return how far the images are from the references."""
+        apart = [image.astype(np.float64) - other for image, other in zip(self.images(values), references, strict=True)]
+        return float(np.sqrt(np.mean(np.square(apart))))
+
     def study(self, start: dict[str, float], references: list[np.ndarray], **options: Any) -> Study:
         """Return the study of a fit from a start."""
         lower, upper = self.thinnest / ROOM, self.thickest * ROOM
@@ -135,135 +157,141 @@ class Setting:
             name: FitParameter(value) if name == "beta" else FitParameter(value, lower, upper)
             for name, value in start.items()
         }
-        views = [
-            replace(view, reference=Reference(image)) for view, image in zip(self.views, references, strict=True)
-        ]
+        pairs = zip(self.views, references, strict=True)
+        views = [replace(view, reference=Reference(image)) for view, image in pairs]
         return Study(self.scene, None, parameters, views=views, **options)
 
     def problem(self, study: Study) -> Problem:
         """Return a study's problem, with what has been captured already."""
         problem = Problem(study)
-        problem.views = [FrozenView(study, view.view, view.index) for view in problem.views]
+        problem.views = [FrozenView(study, view.view, view.index, view.device) for view in problem.views]
         for view, frozen in zip(problem.views, self.frozen, strict=True):
             view.coverage, view.unit = frozen.coverage, frozen.unit
         return problem
 
-    def standard_errors(self, true: dict[str, float]) -> dict[str, float]:
-        """Return the relative standard errors of all parameters at the truth, for noise of float32's rounding."""
-        problem = self.problem(self.study(true, self.images(true)))
+    def standard_errors(self, values: dict[str, float]) -> dict[str, float]:
+        """Return the standard errors of all parameters, relative to their values, for noise of 1 in the image."""
+        problem = self.problem(self.study(values, self.images(values)))
         evaluation = Evaluation(problem, RobustLoss.named("l2", 1.0), problem.start())
-        count = sum(view.reference.size for view in problem.views)
-        found = assess(evaluation.compress(), problem.study.variables, count, evaluation.covered_count)
-        # Those of thicknesses are relative already.
+        covered = evaluation.covered_count
+        certainty = assess(evaluation.compress(), problem.study.variables, self.residual_count, covered)
+        # The image is its own reference: all noise is what `assess` assumes. Those of thicknesses are relative already.
         return {
-            name: float(error) / (true[name] if name == "beta" else 1.0)
-            for name, error in zip(self.names, found.standard_errors, strict=True)
+            name: float(error) / SMALLEST_NOISE / (values[name] if name == "beta" else 1.0)
+            for name, error in zip(self.names, certainty.standard_errors, strict=True)
         }
 
+    def reach(self, values: dict[str, float]) -> dict[str, float]:
+        """Return how far off each parameter can be, relative to its value, in images that pass for the same.
+
+        To first order, the farthest point where images differ by a root mean square of `ARRIVED`; inf where the image
+        is flat.
+        """
+        scale = ARRIVED * np.sqrt(self.residual_count)
+        return {name: float(scale * error) for name, error in self.standard_errors(values).items()}
+
     def recover(self, method: Method, true: dict[str, float], starts: Iterator[dict], budget: float) -> dict[str, Any]:
-        """Fit from one start after the other until one has arrived or the budget is spent."""
-        references, meter, ends = self.images(true), Meter(budget), []
-        while meter.cost > ARRIVED and meter.spent < budget:
-            own = Meter(budget - meter.spent)
-            self._fit(method, own, self.study(next(starts), references, **_options(method, 0)))
-            values = dict(zip(self.names, own.coordinates.tolist(), strict=True))
-            found = {name: value if name == "beta" else float(np.exp(value)) for name, value in values.items()}
-            errors = {name: abs(found[name] - true[name]) / true[name] for name in self.names}
-            ends.append({"errors": errors, "cost": own.cost, "spent": own.spent, "images": own.images})
-            meter.spent += own.spent
-            meter.cost = min(meter.cost, own.cost)
-        best = min(ends, key=lambda end: end["cost"])
+        """Fit from one start after the other until one has arrived or the budget is spent.
+
+        Every second start is the best end so far but for one parameter, in turn: what stays behind is often one
+        thickness that few pixels show.
+
+        Args:
+            method: how.
+            true: the values to find.
+            starts: random ones.
+            budget: of all starts [renders].
+
+        Returns:
+            For JSON: parameters of the best end, their relative errors and the root mean square there; whether it has
+            arrived; renders spent, images and starts; and the end from the first start alone.
+        """
+        references, ends = self.images(true), []
+        spent, best = 0.0, {"root_mean_square": np.inf}
+        while best["root_mean_square"] > ARRIVED and spent < budget:
+            start = next(starts)
+            if len(ends) % 2:
+                name = self.names[len(ends) // 2 % len(self.names)]
+                start = {**best["found"], name: start[name]}
+            meter = Meter(budget - spent)
+            found = self._fit(method, meter, start, references)
+            end = {
+                "found": found,
+                "errors": {name: abs(found[name] - true[name]) / true[name] for name in self.names},
+                "root_mean_square": self.root_mean_square(found, references),
+                "spent": meter.spent,
+                "images": meter.images,
+            }
+            spent += meter.spent
+            ends.append(end)
+            best = min(best, end, key=lambda each: each["root_mean_square"])
         return {
-            "errors": best["errors"],
-            "arrived": meter.cost <= ARRIVED,
-            "spent": meter.spent,
+            **best,
+            "arrived": best["root_mean_square"] <= ARRIVED,
+            "spent": spent,
             "images": sum(end["images"] for end in ends),
             "starts": len(ends),
             "first": ends[0],
         }
 
-    def _fit(self, method: Method, meter: Meter, study: Study) -> None:
+    def _fit(
+        self, method: Method, meter: Meter, start: dict[str, float], references: list[np.ndarray]
+    ) -> dict[str, float]:
         """Fit from one start, stage by stage."""
-        fits: dict[str, Callable] = {"least_squares": _least_squares, "cma": _cma}
-        problem = self.problem(study)
-        for stage in range(len(method.stages)):
-            if stage:
-                problem.study = replace(study, **_options(method, stage))
-                problem = self.problem(self._moved(problem.study, meter.coordinates))
+        kind = "least_squares" if method.kind == "cma" else method.kind
+        for stage in method.stages:
             meter.cost = np.inf
+            problem = self.problem(self.study(start, references, method=kind, **stage))
             try:
-                fits.get(method.kind, _descent)(problem, method, meter)
-            except Enough:
-                return
-
-    def _moved(self, study: Study, coordinates: np.ndarray) -> Study:
-        """Return a study that starts elsewhere."""
-        starts = [v.outward(c) for v, c in zip(study.variables, coordinates, strict=True)]
-        parameters = {
-            name: replace(parameter, start=float(start))
-            for (name, parameter), start in zip(study.parameters.items(), starts, strict=True)
-        }
-        return replace(study, parameters=parameters)
+                _FITS[method.kind](problem, meter)
+            except BudgetError:
+                break
+            finally:
+                start = {name: float(value) for name, value in problem.values(meter.coordinates).items()}
+        return start
 
 
-def _options(method: Method, stage: int) -> dict[str, Any]:
-    return {**method.stages[stage], "method": "least_squares" if method.kind == "cma" else method.kind}
+def _least_squares(problem: Problem, meter: Meter) -> None:
+    images, passes = meter.images, meter.passes
 
-
-def _session(problem: Problem, report: Callable[[Progress], None]) -> Session:
-    return Session(problem.study, "", None, report, 0.0)
-
-
-def _least_squares(problem: Problem, method: Method, meter: Meter) -> None:
-    before = meter.spent, meter.images
-
-    def look(progress: Progress) -> None:
-        images, jacobians = len(fit.costs), len(fit.jacobians)
-        meter.images = before[1] + images
-        meter.spent = before[0] + images + PASS * method.passes * jacobians
+    def look(_: Progress) -> None:
         key, cost = min(fit.costs.items(), key=lambda item: item[1])
-        meter.keep(cost, np.frombuffer(key))
-        if meter.spent >= meter.budget:
-            raise Enough
+        meter.record(images + len(fit.costs), passes + COLORS * len(fit.jacobians), cost, np.frombuffer(key))
 
-    fit = LeastSquares(problem, _session(problem, look))
+    fit = LeastSquares(problem, Session(problem.study, "", None, look, 0.0))
     fit.run(problem.start())
 
 
-def _descent(problem: Problem, method: Method, meter: Meter) -> None:
-    factor = RobustLoss.named(str(problem.study.loss), problem.study.delta).factor
+def _descend(problem: Problem, meter: Meter) -> None:
+    images, passes = meter.images, meter.passes
 
-    def look(progress: Progress) -> None:
-        meter.images = fit.evaluations
-        meter.spent = (1 + PASS) * fit.evaluations
-        meter.keep(fit.best_loss / factor, fit.best)
-        if meter.spent >= meter.budget:
-            raise Enough
+    def look(_: Progress) -> None:
+        meter.record(images + fit.evaluations, passes + fit.evaluations, fit.best_loss, fit.best)
 
-    fit = {"adam": Adam, "lbfgs": LBFGS}[method.kind](problem, _session(problem, look))
+    method = {"adam": Adam, "lbfgs": LBFGS}[str(problem.study.method)]
+    fit = method(problem, Session(problem.study, "", None, look, 0.0))
     fit.run(problem.start())
 
 
-def _cma(problem: Problem, method: Method, meter: Meter) -> None:
-    """Search in a box of unit size."""
+def _search(problem: Problem, meter: Meter) -> None:
+    """Search by CMA-ES in the box of the bounds, scaled to unit size."""
     import cma
 
     loss = problem.study.image_loss.robust
     assert loss is not None
     lower, upper = problem.bounds()
-    options = {"bounds": [0.0, 1.0], "verbose": -9, "seed": 1, "tolfun": 1e-8, "tolfunhist": 1e-8, "tolx": 1e-7}
+    options = {"bounds": [0.0, 1.0], "seed": 1, "verbose": -9, "tolfun": 1e-8, "tolfunhist": 1e-8, "tolx": 1e-7}
     search = cma.CMAEvolutionStrategy((problem.start() - lower) / (upper - lower), 0.25, options)
     while not search.stop():
-        shares = search.ask()
-        costs = []
+        shares, costs = search.ask(), []
         for share in shares:
             coordinates = lower + np.clip(share, 0.0, 1.0) * (upper - lower)
             values = problem.values(coordinates)
-            residuals = [view.residual(view.image(values)) for view in problem.views]
-            costs.append(float(np.mean([loss.rho(residual.astype(np.float64)).mean() for residual in residuals])))
-            meter.images += 1
-            meter.spent += 1
-            meter.keep(costs[-1], coordinates)
-            if meter.spent >= meter.budget:
-                raise Enough
+            residuals = np.array([view.residual(view.image(values)) for view in problem.views], np.float64)
+            costs.append(float(loss.rho(residuals).mean()))
+            meter.record(meter.images + 1, meter.passes, costs[-1], coordinates)
+        # It goes by the order of the costs alone; the root is for its tolerances.
         search.tell(shares, np.sqrt(costs))
+
+
+_FITS = {"least_squares": _least_squares, "adam": _descend, "lbfgs": _descend, "cma": _search}
