@@ -4,8 +4,7 @@ Draws figures/, and writes points.ply, views/ and the numbers of README.md.
 """
 
 import argparse
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,101 +15,174 @@ wp.config.log_level = wp.LOG_WARNING
 import figures  # noqa: E402
 from cloud import load_bunny, render_mesh, sample_points, write_points  # noqa: E402
 from discs import Discs  # noqa: E402
+from fits import FALLOFF, OPAQUE, PAPER, RADIUS, Row, Setting, images_of, mean_psnr, reference_of  # noqa: E402
 from tied import Tied, fit_tied  # noqa: E402
 
 import warpfrag as wf  # noqa: E402
 from warpfrag.capture.coverage import Coverage  # noqa: E402
-from warpfrag.fit import FitParameter, FitResult, Reference, Study, View, load_study  # noqa: E402
-from warpfrag.fit.losses import psnr  # noqa: E402
+from warpfrag.fit import Reference, load_study  # noqa: E402
 from warpfrag.fit.summary import Figure, Summary, Table  # noqa: E402
 from warpfrag.images import write_image  # noqa: E402
-from warpfrag.scene.objects import Scene  # noqa: E402
+from warpfrag.resolve.arguments import Merge  # noqa: E402
+from warpfrag.scene.mesh import Mesh  # noqa: E402
 
 HERE = Path(__file__).parent
 COMMAND = "uv run python experiments/fit/surfels/study.py"
 POINTS = 2000
-# The paper's thickness for points [P(z)].
-PAPER = 10.0
-# Of the falloff that is set by hand [spacings].
-RADIUS = 1.0
-# Thicknesses and numbers of points of the curves [P(z)].
-MULTIPLES = np.geomspace(1.0, 2e5, 17)
-COUNTS = (500, 2000, 8000)
-MERGES = {"smooth": "SFM", "order_independent": "OFM", "exact": "exact"}
-OPAQUE, FALLOFF = "opaque", "falloff"
+# Thicknesses [spacings] and numbers of points of the curves, the latter as shares of the study's.
+MULTIPLES = np.geomspace(1e-3, 30.0, 19)
+SHARES = (0.25, 1.0, 4.0)
+MERGES: dict[Merge, str] = {"none": "plain over", "smooth": "SFM", "order_independent": "OFM", "exact": "exact"}
+ALL = ("color", "opacity", "thickness")
 
 
-@dataclass(frozen=True, eq=False)
-class Row:
-    """What one way of drawing the points gives.
+def main() -> None:
+    """Measure, fit, draw, and write the README's numbers."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("--size", type=int, help="width and height of the images (128)")
+    parser.add_argument("--steps", type=int, help="of each fit (240)")
+    parser.add_argument("--points", type=int, default=POINTS, help=f"how many points ({POINTS})")
+    arguments = parser.parse_args()
+    mesh = load_bunny()
+    setting = prepare(mesh, arguments.size, arguments.steps, arguments.points)
+    if arguments.size is None and arguments.points == POINTS:
+        write_inputs(setting)
+    rows, tied = fit_all(setting)
+    ways: tuple[Merge, ...] = ("smooth", "order_independent", "exact")
+    curves = {(discs, merge): curve(setting, discs, merge) for discs in (OPAQUE, FALLOFF) for merge in ways}
+    by_count = {}
+    for share in SHARES:
+        other = replace(setting, discs=Discs(sample_points(mesh, round(share * arguments.points))))
+        by_count[len(other.discs.points.points)] = curve(other, FALLOFF, "smooth")
+    (HERE / "figures").mkdir(exist_ok=True)
+    figures.images(setting, rows).savefig(HERE / "figures" / "images.png", dpi=150)
+    figures.curves(setting, rows, tied, MULTIPLES, curves, by_count).savefig(HERE / "figures" / "curves.png", dpi=150)
+    summarise(setting, rows, tied, curves, by_count).save(HERE)
 
-    Attributes:
-        discs: opacity at the start: "opaque", or "falloff" from 1 at the centre.
-        fitted: what was fitted, in words.
-        merge: how fragments merged, in words.
-        thickness: of all [P(z)].
-        images: by view.
-    """
 
-    discs: str
-    fitted: str
-    merge: str
-    thickness: float
-    images: dict[str, np.ndarray]
-
-    def psnr(self, views: Sequence[View]) -> float:
-        """Return the mean PSNR of some views [dB]."""
-        return float(np.mean([psnr(self.images[view.name], image_of(view)) for view in views]))
+def prepare(mesh: Mesh, size: int | None, steps: int | None, count: int) -> Setting:
+    """Return the study of study.toml with renders of the mesh as references, and the discs of the points."""
+    study = load_study(HERE / "study.toml")
+    views = []
+    for view in study.all_views:
+        camera = view.camera if size is None else view.camera.resized((size, size))
+        views.append(replace(view, camera=camera, reference=Reference(render_mesh(mesh, camera))))
+    study = replace(study, views=views, reference=None, steps=steps or study.steps)
+    return Setting(study, Discs(sample_points(mesh, count)))
 
 
-@dataclass(frozen=True, eq=False)
-class Points:
-    """The points as discs, and the study they are fitted by.
+def write_inputs(setting: Setting) -> None:
+    """Write what study.toml reads: the points, and the references."""
+    write_points(HERE / "points.ply", setting.discs.points)
+    (HERE / "views").mkdir(exist_ok=True)
+    for view in setting.study.all_views:
+        write_image(HERE / "views" / f"{view.name}.png", reference_of(view))
 
-    Attributes:
-        study: that of study.toml, with references of the size at hand.
-        discs: of the points.
-    """
 
-    study: Study
-    discs: Discs
+def fit_all(setting: Setting) -> tuple[dict[str, Row], Tied]:
+    """Draw the points in all ways, those without fits first."""
+    rows: dict[str, Row] = {}
 
-    @property
-    def spacing(self) -> float:
-        """Mean distance from a point to the nearest other one [P(z) at the middle]."""
-        camera = self.study.scene.camera
-        distance = float(np.linalg.norm(np.subtract(camera.eye, camera.target)))
-        return self.discs.spacing / wf.z_resolution(distance, camera.near, camera.far)
+    def add(name: str, row: Row) -> None:
+        rows[name] = row
+        levels = [mean_psnr(row.images, setting.views(held_out)) for held_out in (False, True)]
+        print(f"{name}: {row.thickness:.0f} P, {levels[0]:.2f} dB, held out {levels[1]:.2f} dB", flush=True)
 
-    def scene(self, discs: str, thickness: float, merge: str = "smooth") -> Scene:
-        """Return the scene of the discs."""
-        opacity = np.ones(len(self.discs.radii)) if discs == OPAQUE else self.discs.falloff(RADIUS)
-        return replace(self.study.scene, objects=[self.discs.item(opacity, thickness)], merge=merge)
+    for discs in (OPAQUE, FALLOFF):
+        for thickness, words in ((0.0, "over"), (PAPER, "10 P"), (setting.spacing, "one spacing")):
+            add(f"{discs}, {words}", setting.draw(discs, thickness))
+    for discs in (OPAQUE, FALLOFF):
+        add(f"{discs}, color, 10 P", setting.fit(discs, ("color",), PAPER))
+        add(f"{discs}, color, t", setting.fit(discs, ("color", "thickness"), setting.spacing))
+    add("all, over", setting.fit(FALLOFF, ("color", "opacity"), 0.0, "none"))
+    add("all, 10 P", setting.fit(FALLOFF, ("color", "opacity"), PAPER))
+    add("all, t", setting.fit(FALLOFF, ALL, setting.spacing))
+    # OFM is constant in the thickness but where slabs begin to overlap: there is no slope to follow.
+    add("all, OFM", setting.fit(FALLOFF, ("color", "opacity"), rows["all, t"].thickness, "order_independent"))
+    add("all, exact", setting.fit(FALLOFF, ALL, setting.spacing, "exact"))
+    tied = fit_tied(setting.study_of(FALLOFF, ALL, setting.spacing), setting.discs, RADIUS)
+    add("tied", Row("by point", ("color", "opacity", "radius", "thickness"), "smooth", tied.thickness, tied.images))
+    found = wf.fit(setting.study)
+    add("study.toml", Row("corners only", ALL, "smooth", float(found.found["points.thickness"]), images_of(found)))
+    return rows, tied
 
-    def draw(self, discs: str, thickness: float) -> Row:
-        """Draw the points with the colours they have."""
-        scene = self.scene(discs, thickness)
-        images = {v.name: np.asarray(wf.render(replace(scene, camera=v.camera))) for v in self.study.all_views}
-        return Row(discs, "nothing", "SFM" if thickness else "plain over", thickness, images)
 
-    def fit(self, discs: str, fitted: str, thickness: float | None = None, merge: str = "smooth") -> tuple[Row, Study]:
-        """Fit colours, or colours and opacities.
+def curve(setting: Setting, discs: str, merge: Merge) -> np.ndarray:
+    """Return the mean PSNR of the held-out views without a fit at 0 and at each of `MULTIPLES` [dB]."""
+    scene = setting.scene(discs, 0.0, merge)
+    views = setting.views(held_out=True)
+    coverages = [Coverage.of(scene, view.camera) for view in views]
+    levels = []
+    for thickness in (0.0, *(MULTIPLES * setting.spacing)):
+        images = {}
+        for view, coverage in zip(views, coverages, strict=True):
+            fragments = coverage.shade({"points.thickness": np.float32(thickness)})
+            images[view.name] = np.asarray(wf.composite(fragments, scene.beta, max_layers=scene.layers, merge=merge))
+        levels.append(mean_psnr(images, views))
+    return np.array(levels)
 
-        Args:
-            discs: opacity at the start.
-            fitted: keys of the parameters, of "thickness", "color" and "opacity", in words.
-            thickness: of all [P(z)]; None fits it as well, from one spacing.
-            merge: how fragments merge.
-        """
-        start = self.spacing if thickness is None else thickness
-        parameters: dict[str, FitParameter] = {}
-        for key in ("color", "opacity"):
-            if key in fitted:
-                parameters[f"points.{key}"] = FitParameter(per="vertex")
-        if thickness is None:
-            parameters["points.thickness"] = replace(self.study.parameters["points.thickness"], start=start)
-        scene = self.scene(discs, start, merge)
-        study = replace(self.study, scene=scene, parameters=parameters)
-        if "color" not in fitted:
-            study = replace(study, method=None, steps=None, batch=None, patience=None)
-        return row_of(wf.fit(study), discs, fitted, MERGES[merge] if start else "plain over", start), study
+
+def gaps(setting: Setting) -> np.ndarray:
+    """Return how far the two nearest discs are apart in each pixel of the held-out views [P(z)]."""
+    camera, scene = setting.study.scene.camera, setting.scene(OPAQUE, 0.0)
+    found = []
+    for view in setting.views(held_out=True):
+        fragments = wf.capture(scene, view.camera)
+        first = fragments.offsets[:-1][np.diff(fragments.offsets) >= 2]
+        near, next_one = fragments.depth[first].astype(np.float64), fragments.depth[first + 1]
+        found.append((next_one - near) / wf.z_resolution(near, camera.near, camera.far))
+    return np.concatenate(found)
+
+
+def summarise(
+    setting: Setting,
+    rows: dict[str, Row],
+    tied: Tied,
+    curves: dict[tuple[str, Merge], np.ndarray],
+    by_count: dict[int, np.ndarray],
+) -> Summary:
+    """Put the numbers into words and tables."""
+    held_out, fitted = setting.views(held_out=True), setting.views(held_out=False)
+    level = {name: mean_psnr(row.images, held_out) for name, row in rows.items()}
+    spacing, apart = setting.spacing, gaps(setting)
+    size = setting.study.all_views[0].camera.size[0]
+    thick = {name: row.thickness / spacing for name, row in rows.items()}
+    cells = tuple(
+        (
+            row.discs,
+            ", ".join(row.fitted) or "–",
+            MERGES[row.merge],
+            f"{row.thickness:.0f}",
+            f"{thick[name]:.3g}",
+            f"{mean_psnr(row.images, fitted):.2f}",
+            f"{level[name]:.2f}",
+        )
+        for name, row in rows.items()
+    )
+    best = {key: (float([0.0, *MULTIPLES][int(np.argmax(levels))]), float(levels.max())) for key, levels in curves.items()}
+    counted = {count: float([0.0, *MULTIPLES][int(np.argmax(levels))]) for count, levels in by_count.items()}
+    radius = np.quantile(tied.radius, (0.1, 0.5, 0.9))
+    answer = (
+        f"10 P(z) is not enough: it is {PAPER / spacing:.4f} spacings of the points, and of the pixels where discs overlap "
+        f"only {np.mean(apart < PAPER):.1%} have the two nearest within it (median {np.median(apart):.0f} P(z), "
+        f"{np.median(apart) / spacing:.2f} spacings)."
+    )
+    return Summary(
+        name="surfels",
+        title="Surfels",
+        question="What must a point set's opacity falloff, thickness and colours be to look like the mesh it is from?",
+        answer=answer,
+        tables=(
+            Table(("discs", "fitted", "merging", "t [P(z)]", "t [spacings]", "fitted views", "held out"), cells, ""),
+        ),
+        figures=(
+            Figure("figures/images.png", "A held-out view by method, and its errors."),
+            Figure("figures/curves.png", "PSNR by thickness."),
+        ),
+        numbers={f"{name} [dB]": value for name, value in level.items()},
+        command=COMMAND,
+    )
+
+
+if __name__ == "__main__":
+    main()

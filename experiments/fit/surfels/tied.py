@@ -10,7 +10,6 @@ import numpy as np
 from discs import Discs
 
 from warpfrag.fit import Study
-from warpfrag.fit.losses import psnr
 from warpfrag.fit.problem import Problem
 
 # Of the radii [spacings].
@@ -24,16 +23,14 @@ class Tied:
     Attributes:
         radius: s of each point [spacings], (P,).
         opacity: o of each point, (P,).
-        thickness: of all, in the study's unit.
-        fitted: mean PSNR of the views that were fitted [dB].
-        held_out: that of the others.
+        thickness: of all [P(z)].
+        images: by view.
     """
 
     radius: np.ndarray
     opacity: np.ndarray
     thickness: float
-    fitted: float
-    held_out: float
+    images: dict[str, np.ndarray]
 
 
 def fit_tied(study: Study, discs: Discs, radius: float) -> Tied:
@@ -81,8 +78,5 @@ def fit_tied(study: Study, discs: Discs, radius: float) -> Tied:
             spread.clamp_(np.log(SMALLEST), np.log(LARGEST))
     with torch.no_grad():
         found = values()
-        fitted, held_out = (
-            float(np.mean([psnr(view.image(found).numpy(), view.reference) for view in views]))
-            for views in (problem.views, problem.held_out)
-        )
-    return Tied(spread.detach().exp().numpy(), opacity.detach().numpy(), float(thick.detach().exp()), fitted, held_out)
+        images = {view.view.name: view.image(found).numpy() for view in (*problem.views, *problem.held_out)}
+    return Tied(spread.detach().exp().numpy(), opacity.detach().numpy(), float(thick.detach().exp()), images)
