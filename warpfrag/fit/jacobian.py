@@ -271,8 +271,8 @@ def _triangle(parts: Sequence[np.ndarray]) -> np.ndarray:
     block = max(QR_ROWS, 2 * columns)
     whole = len(rows) // block * block
     if whole > block:
-        blocks = np.linalg.qr(rows[:whole].reshape(-1, block, columns), mode="r").reshape(-1, columns)
-        rows = np.concatenate([blocks, rows[whole:]])
+        blocks = np.asarray(np.linalg.qr(rows[:whole].reshape(-1, block, columns), mode="r"))
+        rows = np.concatenate([blocks.reshape(-1, columns), rows[whole:]])
     # With at least as many rows as columns it is square.
     padded = np.concatenate([rows, np.zeros((columns, columns))]) if len(rows) < columns else rows
     return np.asarray(np.linalg.qr(padded, mode="r"))

@@ -56,7 +56,8 @@ def images(setting: Setting, rows: Mapping[str, Row]) -> Figure:
                 error = np.abs(image - reference)[..., :3].mean(axis=-1)
                 shown = axes[2, index].imshow(error, vmin=0.0, vmax=DARKEST, cmap="magma_r", interpolation="nearest")
         label = "mean |error| of the channels,\nlinear light"
-        bar = figure.colorbar(shown, ax=axes[2, 0], location="left", fraction=0.08, aspect=12, extend="max", label=label)
+        options = {"location": "left", "fraction": 0.08, "aspect": 12, "extend": "max", "label": label}
+        bar = figure.colorbar(shown, ax=axes[2, 0], **options)
         bar.outline.set_visible(False)
         size = len(reference)
         left, top, edge = (round(share * size) for share in CROP)

@@ -24,7 +24,7 @@ class Row:
     """What one way of drawing the points gives.
 
     Attributes:
-        discs: opacity, or where it starts: `OPAQUE`, or `FALLOFF` from 1 at the centre; or another kind of disc in words.
+        discs: opacity, or where it starts: `OPAQUE`, or `FALLOFF` from 1 at the centre; or another kind of disc.
         fitted: the parameters that were fitted.
         merge: how fragments merged.
         thickness: of all [P(z)].

@@ -30,7 +30,7 @@ HERE = Path(__file__).parent
 COMMAND = "uv run python experiments/fit/surfels/study.py"
 POINTS = 2000
 # Thicknesses [spacings] and numbers of points of the curves, the latter as shares of the study's.
-MULTIPLES = np.geomspace(1e-3, 30.0, 19)
+MULTIPLES = np.geomspace(1e-3, 10.0, 17)
 SHARES = (0.25, 1.0, 4.0)
 MERGES: dict[Merge, str] = {"none": "plain over", "smooth": "SFM", "order_independent": "OFM", "exact": "exact"}
 ALL = ("color", "opacity", "thickness")
@@ -57,7 +57,7 @@ def main() -> None:
     (HERE / "figures").mkdir(exist_ok=True)
     figures.images(setting, rows).savefig(HERE / "figures" / "images.png", dpi=150)
     figures.curves(setting, rows, tied, MULTIPLES, curves, by_count).savefig(HERE / "figures" / "curves.png", dpi=150)
-    summarise(setting, rows, tied, curves, by_count).save(HERE)
+    summarise(setting, rows).save(HERE)
 
 
 def prepare(mesh: Mesh, size: int | None, steps: int | None, count: int) -> Setting:
@@ -134,18 +134,11 @@ def gaps(setting: Setting) -> np.ndarray:
     return np.concatenate(found)
 
 
-def summarise(
-    setting: Setting,
-    rows: dict[str, Row],
-    tied: Tied,
-    curves: dict[tuple[str, Merge], np.ndarray],
-    by_count: dict[int, np.ndarray],
-) -> Summary:
+def summarise(setting: Setting, rows: dict[str, Row]) -> Summary:
     """Put the numbers into words and tables."""
     held_out, fitted = setting.views(held_out=True), setting.views(held_out=False)
     level = {name: mean_psnr(row.images, held_out) for name, row in rows.items()}
     spacing, apart = setting.spacing, gaps(setting)
-    size = setting.study.all_views[0].camera.size[0]
     thick = {name: row.thickness / spacing for name, row in rows.items()}
     cells = tuple(
         (
@@ -159,13 +152,10 @@ def summarise(
         )
         for name, row in rows.items()
     )
-    best = {key: (float([0.0, *MULTIPLES][int(np.argmax(levels))]), float(levels.max())) for key, levels in curves.items()}
-    counted = {count: float([0.0, *MULTIPLES][int(np.argmax(levels))]) for count, levels in by_count.items()}
-    radius = np.quantile(tied.radius, (0.1, 0.5, 0.9))
     answer = (
-        f"10 P(z) is not enough: it is {PAPER / spacing:.4f} spacings of the points, and of the pixels where discs overlap "
-        f"only {np.mean(apart < PAPER):.1%} have the two nearest within it (median {np.median(apart):.0f} P(z), "
-        f"{np.median(apart) / spacing:.2f} spacings)."
+        f"10 P(z) is not enough: it is {PAPER / spacing:.4f} spacings of the points, and of the pixels where discs "
+        f"overlap only {np.mean(apart < PAPER):.1%} have the two nearest within it (median {np.median(apart):.0f} "
+        f"P(z), {np.median(apart) / spacing:.2f} spacings)."
     )
     return Summary(
         name="surfels",
