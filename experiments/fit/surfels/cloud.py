@@ -54,6 +54,7 @@ def render_mesh(mesh: Mesh, camera: Camera) -> np.ndarray:
 
 def sample_points(mesh: Mesh, count: int) -> PointSet:
     """Return points spread evenly over a mesh, with its normals and lit colours; about as many as asked for."""
+    assert mesh.normals is not None
     surface = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     points, face = trimesh.sample.sample_surface_even(surface, count, seed=0)
     shares = trimesh.triangles.points_to_barycentric(surface.triangles[face], points)

@@ -42,6 +42,7 @@ class Discs:
             opacity: of the vertices of each disc, (V,).
             thickness: of all [P(z)].
         """
+        assert self.points.color is not None
         rim = surfels(self.points, RIM, SEGMENTS).vertices.reshape(-1, SEGMENTS, 3)
         centre = self.points.points[:, None]
         rings = [centre + share * (rim - centre) for share in np.arange(1, RINGS + 1) / RINGS]
