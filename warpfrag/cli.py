@@ -30,7 +30,6 @@ app = typer.Typer(
 
 _SIZE = re.compile(r"(\d{1,5})[xX×](\d{1,5})")
 _PIXEL = re.compile(r"(\d{1,5})\s*,\s*(\d{1,5})")
-_P = re.compile(r"\s*([0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)\s*P\s*")
 
 SizeOption = Annotated[str | None, typer.Option("--size", metavar="WxH", help="Width and height in pixels.")]
 
@@ -346,9 +345,11 @@ def _background(text: str) -> tuple[float, ...]:
 
 
 def _with_thickness(item: "SceneObject", option: str, text: str) -> "SceneObject":
-    match = _P.fullmatch(text)
-    if match is not None:
-        return replace(item, thickness=float(match[1]), thickness_unit="P")
+    from warpfrag.scene.objects import multiple_of_p
+
+    multiple = multiple_of_p(text)
+    if multiple is not None:
+        return replace(item, thickness=multiple, thickness_unit="P")
     number = _numbers(option, text, (1,), 'a number, or multiples of P(z) such as "2P"')[0]
     return replace(item, thickness=number, thickness_unit="scene")
 

@@ -82,7 +82,7 @@ def render(
     window = Window.of(camera)
     with surfaces.stream():
         image = _render_window(surfaces, window, beta, options, memory_limit)
-    return _over(image, scene.background) if background else image
+    return over_background(image, scene.background) if background else image
 
 
 def _render_window(
@@ -141,8 +141,8 @@ def _rows(beta: Any, begin: int, end: int) -> Any:
     return beta[begin:end] if kind_of(beta) is not None and len(beta.shape) == 2 else beta
 
 
-def _over(image: Any, background: tuple[float, float, float, float]) -> Any:
-    """Composite an image over a background of one colour."""
+def over_background(image: Any, background: tuple[float, float, float, float]) -> Any:
+    """Composite a premultiplied image (H, W, 4), an array or a tensor, over a background of one colour."""
     if not any(background):
         return image
     if kind_of(image) == "numpy":

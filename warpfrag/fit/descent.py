@@ -10,6 +10,7 @@ several processes each computes the loss of its share of the views; what they ex
 """
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import pairwise
@@ -20,6 +21,7 @@ import numpy as np
 from warpfrag.extras import need
 from warpfrag.fit.maps import Smoothness, coarsen, level_of, refine
 from warpfrag.fit.outcome import Outcome
+from warpfrag.fit.parameters import placed
 from warpfrag.fit.problem import Problem
 from warpfrag.fit.session import FitError, Session, check_finite
 from warpfrag.fit.study import StudyError
@@ -63,7 +65,7 @@ class _Coordinate:
             self.leaf.data.clamp_(self.lower, self.upper)
 
 
-class Descent:
+class Descent(ABC):
     """What both methods share: loss and gradient, stages, the best so far, state to and from checkpoints.
 
     Args:
@@ -88,17 +90,17 @@ class Descent:
         self.states: list[dict[str, Any]] = list(session.state.get("runs", []))
         self.index = -1
 
+    @abstractmethod
     def optimizer(self) -> Any:
         """Return a new optimiser of the leaves."""
-        raise NotImplementedError
 
+    @abstractmethod
     def step(self) -> float:
         """Take one step and return the loss before it."""
-        raise NotImplementedError
 
+    @abstractmethod
     def settled(self) -> str | None:
         """Return why the stage has come to its end, if it has."""
-        raise NotImplementedError
 
     def run(self, start: np.ndarray) -> Outcome:
         """Fit from a start, or go on from where the checkpoint has come to from there."""
@@ -148,10 +150,9 @@ class Descent:
         torch, step = self.torch, len(self.session.losses) + 1
         for coordinate in self.coordinates:
             coordinate.leaf.grad = None
-        inward = [coordinate.coordinate() for coordinate in self.coordinates]
-        outward = [c.variable.outward(tensor) for c, tensor in zip(self.coordinates, inward, strict=True)]
+        outward, priors = self._values_and_priors()
         # Leaves of their own, so that each view's graph is gone before the next is made.
-        leaves = {c.variable.name: t.detach().requires_grad_() for c, t in zip(self.coordinates, outward, strict=True)}
+        leaves = {name: tensor.detach().requires_grad_() for name, tensor in outward.items()}
         values = {name: leaf.detach().cpu().numpy() for name, leaf in leaves.items()}
         total = 0.0
         for index in self.problem.processes.share(views):
@@ -168,8 +169,9 @@ class Descent:
         gradients = [torch.zeros_like(x) if x.grad is None else x.grad for x in leaves.values()]
         total, gradients = self._over_processes(total, gradients)
         check_finite(step, total, values, {n: g.cpu().numpy() for n, g in zip(leaves, gradients, strict=True)})
-        priors = [c.smoothness(t) for c, t in zip(self.coordinates, inward, strict=True) if c.smoothness]
-        torch.autograd.backward([*outward, *priors], [*gradients, *(torch.ones_like(prior) for prior in priors)])
+        torch.autograd.backward(
+            [*outward.values(), *priors], [*gradients, *(torch.ones_like(prior) for prior in priors)]
+        )
         self.evaluations += 1
         return total + sum(float(prior.detach()) for prior in priors)
 
@@ -186,15 +188,18 @@ class Descent:
 
     def full_loss(self) -> float:
         """Return the loss of all views, prior included, without a gradient."""
-        torch = self.torch
-        with torch.no_grad():
-            inward = [coordinate.coordinate() for coordinate in self.coordinates]
-            outward = {c.variable.name: c.variable.outward(t) for c, t in zip(self.coordinates, inward, strict=True)}
+        with self.torch.no_grad():
+            outward, priors = self._values_and_priors()
             mine = self.problem.processes.share(list(range(len(self.problem.views))))
             views = [self.problem.views[index] for index in mine]
             total = sum(float(view.loss(view.image(outward))) for view in views) / len(self.problem.views)
-            priors = [float(c.smoothness(t)) for c, t in zip(self.coordinates, inward, strict=True) if c.smoothness]
-        return float(self.problem.processes.sum(np.array([total]))[0]) + sum(priors)
+        return float(self.problem.processes.sum(np.array([total]))[0]) + sum(float(prior) for prior in priors)
+
+    def _values_and_priors(self) -> tuple[dict[str, Any], list[Any]]:
+        """Return the parameters by name, and the priors of those that have one, differentiable in the leaves."""
+        inward = [(coordinate, coordinate.coordinate()) for coordinate in self.coordinates]
+        values = {each.variable.name: each.variable.outward(tensor) for each, tensor in inward}
+        return values, [each.smoothness(tensor) for each, tensor in inward if each.smoothness]
 
     def vector(self) -> np.ndarray:
         """Return all coordinates as one vector."""
@@ -217,11 +222,8 @@ class Descent:
         """Begin a stage from a vector of coordinates."""
         self.stage, self.stage_end = stage, end
         self.scores: list[float] = []
-        first = 0
-        for coordinate in self.coordinates:
-            last = first + coordinate.variable.start.size
-            coordinate.put(vector[first:last], stage)
-            first = last
+        for coordinate, (_, place) in zip(self.coordinates, placed(self.study.variables), strict=True):
+            coordinate.put(vector[place], stage)
         self.torch_optimizer = self.optimizer()
 
     def _state(self) -> dict[str, Any]:

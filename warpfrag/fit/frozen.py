@@ -49,14 +49,14 @@ class UnitFragments:
         return [i for i, item in enumerate(self.names) if (item == owner if owner else item not in own)]
 
     def scales(self, values: Mapping[str, Any], fitted: Sequence[Variable]) -> tuple[np.ndarray, np.ndarray]:
-        """Return the factors of each object's colours and opacity, (objects, 4), and thickness, (objects,)."""
+        """Return each object's colour and opacity, (objects, 4), and thickness, (objects,); 1 where not fitted."""
         rgba, thickness = np.ones((len(self.names), 4), np.float32), np.ones(len(self.names), np.float32)
         for variable in fitted:
             owned, value = self.owned(variable.name, fitted), np.asarray(values.get(variable.name, 1.0))
             if variable.key == "color":
-                rgba[owned, :3] *= value
+                rgba[owned, :3] = value
             elif variable.key == "opacity":
-                rgba[owned] *= value
+                rgba[owned, 3] = value
             elif variable.key == "thickness":
                 thickness[owned] = value
         return rgba, thickness
@@ -64,5 +64,10 @@ class UnitFragments:
     def scaled(self, values: Mapping[str, Any], fitted: Sequence[Variable]) -> Fragments:
         """Return the fragments for parameter values."""
         rgba, thickness = self.scales(values, fitted)
-        unit = self.fragments
-        return replace(unit, rgba=unit.rgba * rgba[self.objects], thickness=unit.thickness * thickness[self.objects])
+        unit, factors = self.fragments, premultiplied(rgba)[self.objects]
+        return replace(unit, rgba=unit.rgba * factors, thickness=unit.thickness * thickness[self.objects])
+
+
+def premultiplied(rgba: np.ndarray) -> np.ndarray:
+    """Return straight colours and opacities (N, 4) with the colours multiplied by the opacities."""
+    return np.concatenate([rgba[:, :3] * rgba[:, 3:], rgba[:, 3:]], axis=1)

@@ -12,27 +12,27 @@ few hundred bytes, and processes exchange no more.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from warpfrag.capture.coverage import Coverage
-from warpfrag.fit.frozen import UnitFragments
+from warpfrag.fit.frozen import UnitFragments, premultiplied
 from warpfrag.fit.losses import RobustLoss, pyramid
-from warpfrag.fit.parameters import CAMERA
+from warpfrag.fit.parameters import placed
 from warpfrag.fit.problem import Problem, ViewProblem
 from warpfrag.fragments import Fragments
 from warpfrag.interop.launch import Span, launch
-from warpfrag.scene.pose import pose_matrix
+from warpfrag.scene.pose import CAMERA, pose_matrix
 
 wp.set_module_options({"enable_backward": False})
 
 # A QR decomposition of so many rows at a time stays in the cache: four to seven times as fast as all at once.
 QR_ROWS = 512
-# Columns of the table of objects: where a derivative goes, −1 for nowhere.
-_THICKNESS, _OPACITY, _COLOR = 0, 1, 2
+# Columns of the table that says of each object where derivatives go.
+_KINDS = ("thickness", "opacity", "color")
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,7 @@ def _sum_kernel() -> wp.Kernel:
         offsets: wp.array[int],
         object_id: wp.array[int],
         columns: wp.array[wp.vec3i],
-        rgba_scale: wp.array[wp.vec4f],
+        straight: wp.array[wp.vec4f],
         unit_rgba: wp.array[wp.vec4f],
         thickness: wp.array[float],
         grad_rgba: wp.array[wp.vec4f],
@@ -76,9 +76,9 @@ def _sum_kernel() -> wp.Kernel:
                     sums[pixel, column[0]] = sums[pixel, column[0]] + wp.float64(to_log)
                 if column[1] >= 0 or column[2] >= 0:
                     g = wp.cw_mul(grad_rgba[fragment], unit_rgba[fragment])
-                    scale = rgba_scale[item]
+                    scale = straight[item]
+                    # A fragment's colour is unit · colour · opacity, its opacity unit · opacity.
                     if column[1] >= 0:
-                        # scale = (colour·opacity, opacity), where the opacity is kept apart as the last.
                         to_opacity = g[0] * scale[0] + g[1] * scale[1] + g[2] * scale[2] + g[3]
                         sums[pixel, column[1]] = sums[pixel, column[1]] + wp.float64(to_opacity)
                     if column[2] >= 0:
@@ -151,7 +151,7 @@ class ViewEvaluation:
 
     def channel(self, channel: int) -> np.ndarray:
         """Return the derivatives of one channel of the image in all coordinates, (pixels, coordinates)."""
-        background, count = self.problem.background, int(self.fragments.offsets.size) - 1
+        background, count = self.problem.scene.background, int(self.fragments.offsets.size) - 1
         sums = np.zeros((count, sum(variable.start.size for variable in self.variables)))
         # Opacity does not depend on beta, thickness, colour or depth: no pass where it cannot change. Texture and
         # opacity per vertex move with their surface.
@@ -166,43 +166,35 @@ class ViewEvaluation:
         self.tape.zero()
         self.tape.backward(grads={self.raw: wp.array(seed, device=self.raw.device)})
         self._sum_objects(sums)
-        first = 0
-        for variable in self.variables:
+        for variable, place in placed(self.variables):
             if variable.key == "beta":
-                sums[:, first] = self.beta.grad.numpy().reshape(-1)
-            first += variable.start.size
+                sums[:, place.start] = self.beta.grad.numpy().reshape(-1)
         if self.problem.moves:
             self._sum_motions(sums)
         return sums
 
+    @cached_property
+    def _columns(self) -> np.ndarray:
+        """The column of each object's thickness, opacity and colour, −1 for none, (objects, 3)."""
+        columns = np.full((len(self.unit.names), 3), -1, np.int32)
+        for variable, place in placed(self.variables):
+            if variable.key in _KINDS:
+                columns[self.unit.owned(variable.name, self.variables), _KINDS.index(variable.key)] = place.start
+        return columns
+
     def _sum_objects(self, sums: np.ndarray) -> None:
         """Add what thicknesses, opacities and colours contribute, by pixel."""
         unit, device = self.unit, self.raw.device
-        columns = np.full((len(unit.names), 3), -1, np.int32)
-        first = 0
-        for variable in self.variables:
-            kind = {"thickness": _THICKNESS, "opacity": _OPACITY, "color": _COLOR}.get(variable.key)
-            if kind is not None:
-                columns[unit.owned(variable.name, self.variables), kind] = first
-            first += variable.start.size
-        if (columns < 0).all():
+        if (self._columns < 0).all():
             return
-        # Of the colours without the opacity, and that one.
-        scale = np.ones((len(unit.names), 4), np.float32)
-        for variable in self.variables:
-            owned = unit.owned(variable.name, self.variables)
-            if variable.key == "color":
-                scale[owned, :3] = self.values[variable.name]
-            elif variable.key == "opacity":
-                scale[owned, 3] = self.values[variable.name]
         none = wp.empty((0,), dtype=wp.vec4f, device=device)
         nothing = wp.empty((0,), dtype=float, device=device)
         target = wp.array(sums, device=device, copy=False)
         inputs = [
             wp.array(self.fragments.offsets, dtype=int, device=device, copy=False),
             wp.array(unit.objects, dtype=int, device=device, copy=False),
-            wp.array(columns, dtype=wp.vec3i, device=device),
-            wp.array(scale, dtype=wp.vec4f, device=device),
+            wp.array(self._columns, dtype=wp.vec3i, device=device),
+            wp.array(unit.scales(self.values, self.variables)[0], dtype=wp.vec4f, device=device),
             wp.array(unit.fragments.rgba, dtype=wp.vec4f, device=device, copy=False),
             self.thickness,
             none if self.rgba.grad is None else self.rgba.grad.view(wp.vec4f),
@@ -213,28 +205,39 @@ class ViewEvaluation:
         if not device.is_cpu:
             sums[...] = target.numpy()
 
+    @cached_property
+    def _motions(self) -> list[tuple[int, np.ndarray, np.ndarray]]:
+        """Of each transform its first column, its fragments, and what turns their motions into derivatives (6, 3)."""
+        unit, found = self.unit, []
+        for variable, place in placed(self.variables):
+            if variable.moves:
+                begin = place.start + (3 * self.problem.index if variable.per == "view" else 0)
+                members = np.arange(unit.objects.size)
+                if variable.owner != CAMERA:
+                    members = np.flatnonzero(unit.objects == unit.names.index(variable.owner))
+                matrix = pose_matrix(variable.name, self.problem.scene, parameters=unit.parameters) * variable.unit
+                found.append((begin, members, matrix))
+        return found
+
     def _sum_motions(self, sums: np.ndarray) -> None:
         """Add what transforms of objects and of the camera contribute, by pixel."""
-        unit, scene = self.unit, self.problem.scene
+        unit = self.unit
         rgba_scale, thickness_scale = unit.scales(self.values, self.variables)
         motions = self.coverage.motion_gradients(
             unit.parameters,
-            self.rgba.grad.numpy() * rgba_scale[unit.objects],
+            self.rgba.grad.numpy() * premultiplied(rgba_scale)[unit.objects],
             self.depth.grad.numpy(),
             self.thickness.grad.numpy() * thickness_scale[unit.objects],
         )
+        for begin, members, matrix in self._motions:
+            for index, column in enumerate((motions[members] @ matrix).T):
+                sums[:, begin + index] = np.bincount(self._pixels[members], column, len(sums))
+
+    @cached_property
+    def _pixels(self) -> np.ndarray:
+        """The pixel of each fragment."""
         offsets = np.asarray(self.fragments.offsets)
-        pixels = np.repeat(np.arange(offsets.size - 1), np.diff(offsets))
-        first = 0
-        for variable in self.variables:
-            if variable.moves:
-                begin = first + (3 * self.problem.index if variable.per == "view" else 0)
-                whole = variable.owner == CAMERA
-                members = slice(None) if whole else np.flatnonzero(unit.objects == unit.names.index(variable.owner))
-                matrix = pose_matrix(variable.name, scene, parameters=unit.parameters) * variable.unit
-                for index, column in enumerate((motions[members] @ matrix).T):
-                    sums[:, begin + index] = np.bincount(pixels[members], column, len(sums))
-            first += variable.start.size
+        return np.repeat(np.arange(offsets.size - 1), np.diff(offsets))
 
 
 class Evaluation:

@@ -217,12 +217,13 @@ def _window(size: int) -> np.ndarray:
     return weights / weights.sum()
 
 
-def psnr(image: np.ndarray, reference: np.ndarray) -> float:
+def psnr(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
     """Return the peak signal-to-noise ratio of the colours [dB], in linear light with peak 1; inf where they are equal.
 
     Args:
         image: (H, W, 3 or 4); an opacity plays no part.
         reference: the same of another image, with opacity or without.
+        mask: the pixels that count, (H, W) bool; None for all.
 
     Raises:
         ValueError: the images have different sizes.
@@ -231,5 +232,5 @@ def psnr(image: np.ndarray, reference: np.ndarray) -> float:
         found, expected = (f"{shape[1]} × {shape[0]}" for shape in (image.shape, reference.shape))
         raise ValueError(f"image: found {found} pixels, expected {expected} like the reference")
     error = np.asarray(image[..., :3], np.float64) - np.asarray(reference[..., :3], np.float64)
-    mean_square = float(np.mean(error * error))
+    mean_square = float(np.mean(np.square(error if mask is None else error[mask])))
     return -10.0 * math.log10(mean_square) if mean_square > 0.0 else math.inf

@@ -5,8 +5,7 @@ a factor, whatever the scene's unit, and a thickness cannot become negative. Bou
 """
 
 import math
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
@@ -14,7 +13,8 @@ import numpy as np
 
 from warpfrag.scene.camera import Camera
 from warpfrag.scene.errors import shorten, suggest
-from warpfrag.scene.objects import Scene, SceneObject
+from warpfrag.scene.objects import Scene, SceneObject, multiple_of_p
+from warpfrag.scene.pose import CAMERA, POSE_KEYS
 
 Per = Literal["object", "vertex", "pixel", "view"]
 PER = get_args(Per)
@@ -26,11 +26,7 @@ LARGEST_THICKNESS = 1.0
 # do. One of a rotation is a radian.
 VERTEX_UNIT = 0.1
 # What moves surfaces or the camera: depths, and not only colours and thicknesses, depend on it.
-MOTIONS = ("vertices", "translation", "rotation")
-CAMERA = "camera"
-
-# A thickness in multiples of P(z).
-MULTIPLE_OF_P = re.compile(r"\s*([0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)\s*P\s*")
+MOTIONS = ("vertices", *POSE_KEYS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,6 +128,14 @@ class Variable:
         return value[view] if stacked else value
 
 
+def placed(variables: Sequence[Variable]) -> Iterator[tuple[Variable, slice]]:
+    """Yield each variable with its place in the vector of all coordinates."""
+    first = 0
+    for variable in variables:
+        yield variable, slice(first, first + variable.start.size)
+        first += variable.start.size
+
+
 def in_multiples_of_p(scene: Scene, values: Mapping[str, Any], where: str) -> tuple[Scene, dict[str, Any]]:
     """Turn values such as "2P" into numbers, and their objects into ones whose thickness is in multiples of P(z).
 
@@ -147,11 +151,11 @@ def in_multiples_of_p(scene: Scene, values: Mapping[str, Any], where: str) -> tu
     for name, value in values.items():
         if isinstance(value, str):
             owner, _, key = name.rpartition(".")
-            match = MULTIPLE_OF_P.fullmatch(value) if key == "thickness" else None
-            if match is None:
+            multiple = multiple_of_p(value) if key == "thickness" else None
+            if multiple is None:
                 expected = 'numbers or multiples of P(z) such as "2P"' if key == "thickness" else "numbers"
                 raise ValueError(f"{where}.{name}: found {shorten(value)}, expected {expected}")
-            value = float(match[1])
+            value = multiple
             objects = [
                 replace(item, thickness=value, thickness_unit="P")
                 if owner in ("", item.name) and item.thickness_unit != "P"
@@ -181,10 +185,10 @@ def resolve_parameters(
     Raises:
         ValueError: an unknown name, a start of the wrong shape, or one that is not between the bounds.
     """
-    variables = []
+    variables, size = [], extent(scene)
     for name, parameter in parameters.items():
         check_name(name, scene, "parameters")
-        variables.append(_resolve(scene, cameras, name, parameter))
+        variables.append(_resolve(scene, cameras, size, name, parameter))
     if "thickness" in parameters and len({item.thickness_unit for item in scene.objects}) > 1:
         found = "objects with thicknesses in scene units and in multiples of P(z)"
         raise ValueError(f'parameters.thickness: found {found}, expected one unit (a start such as "2P" sets it)')
@@ -193,7 +197,7 @@ def resolve_parameters(
 
 def check_name(name: str, scene: Scene, where: str) -> None:
     """Raise for a parameter that the scene does not have."""
-    known = {"thickness", *scene.parameters()}
+    known = scene.parameter_names()
     if name not in known:
         raise ValueError(f"{where}: found the unknown name {shorten(name)}; {suggest(name, known)}")
 
@@ -234,11 +238,11 @@ def flatten_names(table: Mapping[str, Any], scene: Scene) -> dict[str, Any]:
     return flat
 
 
-def _resolve(scene: Scene, cameras: Sequence[Camera], name: str, parameter: FitParameter) -> Variable:
+def _resolve(scene: Scene, cameras: Sequence[Camera], size: float, name: str, parameter: FitParameter) -> Variable:
     where = f"parameters.{name}"
     key = name.rpartition(".")[2]
     start, per = _start(scene, cameras, name, parameter, where)
-    size, lower, upper = extent(scene), -math.inf, math.inf
+    lower, upper = -math.inf, math.inf
     if key == "thickness":
         items = scene.objects if name == "thickness" else [find_object(scene, name)]
         lower, upper = _thickness_bounds(scene, items, size)

@@ -12,10 +12,10 @@ import numpy as np
 
 from warpfrag.capture.coverage import Coverage
 from warpfrag.capture.kbuffer import capture_kbuffer
-from warpfrag.capture.render import render
+from warpfrag.capture.render import over_background, render
 from warpfrag.composite import composite
 from warpfrag.fit.frozen import UnitFragments
-from warpfrag.fit.parameters import in_multiples_of_p
+from warpfrag.fit.parameters import in_multiples_of_p, placed
 from warpfrag.fit.processes import Processes
 from warpfrag.fit.study import RENDER_OPTIONS, Study, View, true_of_view
 from warpfrag.fragments import Fragments
@@ -43,7 +43,6 @@ class ViewProblem:
         self.moves = any(variable.moves for variable in study.variables)
         self.reference = reference_image(study, view, index)
         self.channels = self.reference.shape[2]
-        self.background = np.asarray(self.scene.background, np.float32)
 
     @cached_property
     def coverage(self) -> Coverage:
@@ -84,7 +83,7 @@ class ViewProblem:
 
     def over_background(self, image: Any) -> Any:
         """Return a premultiplied image, an array or a tensor, over the scene's background."""
-        return _over(image, self.background)
+        return over_background(image, self.scene.background)
 
     def residual(self, image: Any) -> Any:
         """Return image minus reference, (H, W, C), an array or a tensor."""
@@ -112,12 +111,10 @@ class Problem:
 
     def values(self, coordinates: np.ndarray) -> dict[str, np.ndarray]:
         """Return the parameters for a vector of a method's coordinates."""
-        values, first = {}, 0
-        for variable in self.study.variables:
-            last = first + variable.start.size
-            values[variable.name] = np.asarray(variable.outward(coordinates[first:last].reshape(variable.start.shape)))
-            first = last
-        return values
+        return {
+            variable.name: np.asarray(variable.outward(coordinates[place].reshape(variable.start.shape)))
+            for variable, place in placed(self.study.variables)
+        }
 
     def start(self) -> np.ndarray:
         """Return the start as a vector of a method's coordinates, float64."""
@@ -149,27 +146,16 @@ class Problem:
         return starts
 
 
-def _namespace(array: Any) -> Any:
-    if kind_of(array) == "torch":
-        import torch
-
-        return torch
-    return np
-
-
 def _like(array: np.ndarray, image: Any) -> Any:
-    xp = _namespace(image)
-    return array if xp is np else xp.as_tensor(array, device=image.device)
+    if kind_of(image) != "torch":
+        return array
+    import torch
+
+    return torch.as_tensor(array, device=image.device)
 
 
 def _single(value: Any) -> Any:
     return value.float() if kind_of(value) == "torch" else np.asarray(value, np.float32)
-
-
-def _over(image: Any, background: np.ndarray) -> Any:
-    if not background.any():
-        return image
-    return image + (1.0 - image[..., 3:]) * _like(background, image)
 
 
 def render_scene(scene: Scene, resolve: str, parameters: Mapping[str, Any]) -> Any:
@@ -177,7 +163,7 @@ def render_scene(scene: Scene, resolve: str, parameters: Mapping[str, Any]) -> A
     if resolve == "sorted":
         return render(scene, parameters=parameters)
     layers = capture_kbuffer(scene, slots=scene.layers, merge=scene.merge, parameters=parameters)  # type: ignore[arg-type]
-    return _over(composite(layers), np.asarray(scene.background, np.float32))
+    return over_background(composite(layers), scene.background)
 
 
 def reference_image(study: Study, view: View, index: int = 0) -> np.ndarray:
@@ -193,9 +179,7 @@ def reference_image(study: Study, view: View, index: int = 0) -> np.ndarray:
     height, width = view.camera.shape
     if reference.image is not None:
         image = np.asarray(reference.image, np.float32)
-        if image.shape[2] == 4:
-            image = image + (1.0 - image[..., 3:]) * np.asarray(scene.background, np.float32)
-        return image
+        return over_background(image, scene.background) if image.shape[2] == 4 else image
     samples = reference.supersampling
     options = {key: getattr(reference, key) or getattr(scene, key) for key in RENDER_OPTIONS}
     fine = replace(scene, camera=view.camera.resized((width * samples, height * samples)), **options)

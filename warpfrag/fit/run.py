@@ -11,6 +11,7 @@ import numpy as np
 
 from warpfrag.extras import need
 from warpfrag.fit.bar import progress_bar
+from warpfrag.fit.parameters import placed
 from warpfrag.fit.processes import is_first_process
 from warpfrag.fit.result import FitResult, Run, ViewResult, plain_value
 from warpfrag.fit.session import CHECKPOINT, FitError, Progress, Session, fingerprint
@@ -159,12 +160,10 @@ def _certainty(
     evaluation = Evaluation(problem, study.image_loss.robust or RobustLoss.named("l2", study.delta), coordinates)
     residual_count = sum(view.reference.size for view in problem.views)
     certainty = assess(evaluation.compress(), study.variables, residual_count, evaluation.covered_count)
-    errors, first = {}, 0
-    for variable in study.variables:
-        last = first + variable.start.size
-        error = certainty.standard_errors[first:last].reshape(variable.start.shape)
+    errors = {}
+    for variable, place in placed(study.variables):
+        error = certainty.standard_errors[place].reshape(variable.start.shape)
         errors[variable.name] = plain_value(error * (found[variable.name] if variable.logarithm else variable.unit))
-        first = last
     return errors, certainty.condition_number, certainty.undetermined
 
 

@@ -29,13 +29,13 @@ from typing import Any, get_args
 
 import numpy as np
 
-from warpfrag.fit.parameters import MULTIPLE_OF_P, PER, FitParameter, check_name, flatten_names
+from warpfrag.fit.parameters import PER, FitParameter, check_name, flatten_names
 from warpfrag.fit.study import RENDER_OPTIONS, Method, Reference, Resolve, Study, StudyError, View
 from warpfrag.images import ImageError, read_image
 from warpfrag.scene.colors import parse_hex
 from warpfrag.scene.errors import SceneError, shorten
-from warpfrag.scene.files import CAMERA_KEYS, load_scene, read_camera
-from warpfrag.scene.objects import MERGES, MIXES, Scene
+from warpfrag.scene.files import CAMERA_KEYS, load_scene, read_camera, read_size
+from warpfrag.scene.objects import MERGES, MIXES, Scene, multiple_of_p
 from warpfrag.scene.table import Table, is_number, is_numbers, read_toml
 
 _INTEGERS = ("steps", "seed", "restarts", "scales", "patience", "batch")
@@ -43,7 +43,7 @@ _NUMBERS = ("delta", "tolerance", "learning_rate", "checkpoint_seconds")
 _TOP: tuple[str, ...] = ("scene", "size", "reference", "view", "parameters", "loss", "method", "resolve", "device")
 _TOP += (*_INTEGERS, *_NUMBERS, *RENDER_OPTIONS)
 _PARAMETER = ("start", "lower", "upper", "per", "learning_rate", "smoothness", "levels")
-_MOST_PIXELS, _MOST_STEPS = 65536, 10**9
+_MOST_STEPS = 10**9
 
 
 def load_study(path: str | os.PathLike, *, size: tuple[int, int] | None = None) -> Study:
@@ -98,12 +98,8 @@ def _scene(top: Table, path: Path, size: tuple[int, int] | None) -> Scene:
     if not file.is_file():
         raise top.error("scene", f"no such file at {file}", "a scene file")
     scene = load_scene(file)
-    if "size" in top:
-        value = top.data["size"]
-        whole = isinstance(value, list) and len(value) == 2 and all(type(part) is int for part in value)
-        if not whole or not 1 <= min(value) <= max(value) <= _MOST_PIXELS:
-            raise top.error("size", shorten(value), f"width and height, two whole numbers from 1 to {_MOST_PIXELS}")
-        size = size or (value[0], value[1])
+    given = read_size(top)
+    size = size or given
     if size is not None:
         scene = replace(scene, camera=scene.camera.resized(size))
     overrides = {key: value for key, value in _render_options(top).items() if value is not None}
@@ -194,7 +190,7 @@ def _value(table: Table, key: str, name: str, value: Any) -> Any:
         color = parse_hex(value) if kind == "color" else None
         if color is not None:
             return list(color[:3])
-        if kind == "thickness" and MULTIPLE_OF_P.fullmatch(value):
+        if kind == "thickness" and multiple_of_p(value) is not None:
             return value
     if is_number(value) and kind != "color":
         return float(value)

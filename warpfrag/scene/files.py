@@ -21,7 +21,6 @@ image cuts out (alpha 0) stays cut out.
 """
 
 import os
-import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -34,8 +33,9 @@ from warpfrag.scene.colors import linear_image, parse_hex
 from warpfrag.scene.errors import SceneError, shorten
 from warpfrag.scene.loading import GREY, load_mesh, warp_asset
 from warpfrag.scene.mesh import Mesh, lambert, smooth_normals, split_faces, transformed_normals
-from warpfrag.scene.objects import MERGES, MIXES, Scene, SceneObject
+from warpfrag.scene.objects import MERGES, MIXES, Scene, SceneObject, multiple_of_p
 from warpfrag.scene.points import load_points, surfels
+from warpfrag.scene.pose import CAMERA
 from warpfrag.scene.table import Table, is_number, is_numbers, number_words, read_toml
 
 _TOP = ("beta", "layers", "merge", "mix", "background", "camera", "light", "object")
@@ -58,7 +58,6 @@ _SHAPES = ("mesh", "primitive", "points")
 _SEGMENTS, _CELLS, _PIXELS = 4096, 4096, 65536
 # Of each disc: more are not rounder at any size worth a disc.
 _DISC_SEGMENTS = 64
-_P = re.compile(r"\s*([0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)\s*P\s*")
 
 
 def load_scene(path: str | os.PathLike) -> Scene:
@@ -95,7 +94,7 @@ def load_scene(path: str | os.PathLike) -> Scene:
     objects: list[SceneObject] = []
     for index, entry in enumerate(entries):
         item = _object(entry, path, index, meshes, camera, light)
-        if item.name == "camera":
+        if item.name == CAMERA:
             raise SceneError(f'{path}: object[{index}].name: found "camera", expected another: the camera has it')
         for other, earlier in enumerate(objects):
             if earlier.name == item.name:
@@ -127,12 +126,7 @@ def read_camera(table: Table, base: Camera | None = None) -> Camera:
     """
     values: dict[str, Any] = {key: table.numbers(key, 3, "3 numbers") for key in ("eye", "target", "up")}
     values.update({key: table.number(key) for key in ("fov", "height", "near", "far")})
-    if "size" in table:
-        size = table.data["size"]
-        whole = isinstance(size, list) and len(size) == 2 and all(type(part) is int for part in size)
-        if not whole or not 1 <= min(size) <= max(size) <= _PIXELS:
-            raise table.error("size", shorten(size), f"width and height, two whole numbers from 1 to {_PIXELS}")
-        values["size"] = tuple(size)
+    values["size"] = read_size(table)
     values = {key: value for key, value in values.items() if value is not None}
     # One of the two kinds of camera takes the place of the other.
     for key, other in (("fov", "height"), ("height", "fov")):
@@ -142,6 +136,21 @@ def read_camera(table: Table, base: Camera | None = None) -> Camera:
         return Camera(**values) if base is None else replace(base, **values)
     except ValueError as error:
         raise SceneError(f"{table.file}: {' '.join(str(error).split())}") from None
+
+
+def read_size(table: Table) -> tuple[int, int] | None:
+    """Read ``size``, width and height in pixels; None where it is absent.
+
+    Raises:
+        SceneError: It is not two whole numbers in range.
+    """
+    if "size" not in table:
+        return None
+    size = table.data["size"]
+    whole = isinstance(size, list) and len(size) == 2 and all(type(part) is int for part in size)
+    if not whole or not 1 <= min(size) <= max(size) <= _PIXELS:
+        raise table.error("size", shorten(size), f"width and height, two whole numbers from 1 to {_PIXELS}")
+    return size[0], size[1]
 
 
 def _object(
@@ -338,9 +347,9 @@ def _image(table: Table, file: Path) -> np.ndarray:
 
 def _thickness(table: Table, default: str) -> tuple[float, Any]:
     value = table.data.get("thickness", default)
-    match = _P.fullmatch(value) if isinstance(value, str) else None
-    if match is not None and np.isfinite(float(match[1])):
-        return float(match[1]), "P"
+    multiple = multiple_of_p(value) if isinstance(value, str) else None
+    if multiple is not None and np.isfinite(multiple):
+        return multiple, "P"
     if not is_number(value) or value < 0:
         raise table.error(
             "thickness", shorten(value), number_words(0.0, np.inf, None) + ', or multiples of P(z) like "2P"'

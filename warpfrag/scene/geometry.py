@@ -24,7 +24,7 @@ from warpfrag.scene.objects import (
     check_parameter,
     check_pose,
 )
-from warpfrag.scene.pose import POSE_KEYS, move_object
+from warpfrag.scene.pose import CAMERA, POSE_KEYS, move_object
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ def assemble(scene: Scene, parameters: Mapping[str, Any] | None = None, *, camer
         textures=textures,
         thickness_maps=thickness_maps,
         thickness_in_p=np.array([item.thickness_unit == "P" for item in scene.objects], dtype=bool),
-        camera_pose=_pose("camera", overrides, kind),
+        camera_pose=_pose(CAMERA, overrides, kind),
     )
 
 
@@ -198,8 +198,7 @@ def _texture_ids(item: SceneObject, first: int) -> np.ndarray:
 def _checked(scene: Scene, parameters: Mapping[str, Any]) -> dict[str, Any]:
     if not isinstance(parameters, Mapping):
         raise TypeError(f"parameters: found {type(parameters).__name__}, expected a mapping from names to values")
-    names = [f"{item.name}.{key}" for item in scene.objects for key in (*PARAMETER_KEYS, *POSE_KEYS)]
-    known = {"beta", "thickness", *names, *(f"camera.{key}" for key in POSE_KEYS)}
+    known = scene.parameter_names()
     checked = {}
     for name, value in parameters.items():
         if name not in known:

@@ -1,6 +1,7 @@
 """What stands in a scene, and its parameters by name."""
 
 import math
+import re
 import sys
 from collections import Counter
 from dataclasses import dataclass, field
@@ -10,9 +11,10 @@ import numpy as np
 
 from warpfrag.scene.camera import Camera
 from warpfrag.scene.errors import shorten
-from warpfrag.scene.pose import POSE_KEYS
+from warpfrag.scene.pose import CAMERA, POSE_KEYS
 
 PARAMETER_KEYS = ("thickness", "color", "opacity", "vertices")
+_MULTIPLE_OF_P = re.compile(r"\s*([0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)\s*P\s*")
 MERGES = ("none", "smooth", "order_independent", "exact")
 MIXES = ("opacity", "average", "optical_depth")
 
@@ -169,7 +171,7 @@ class Scene:
         repeated = [name for name, count in Counter(item.name for item in self.objects).items() if count > 1]
         if repeated:
             raise ValueError(f'objects: found the name "{repeated[0]}" more than once, expected unique names')
-        if any(item.name == "camera" for item in self.objects):
+        if any(item.name == CAMERA for item in self.objects):
             raise ValueError(
                 'objects: found the name "camera", expected another (the camera\'s own parameters have it)'
             )
@@ -211,9 +213,20 @@ class Scene:
                 result[f"{item.name}.{key}"] = (
                     float(value) if np.ndim(value) == 0 else np.array(value, dtype=np.float32)
                 )
-        for owner in (*(item.name for item in self.objects), "camera"):
+        for owner in (*(item.name for item in self.objects), CAMERA):
             result.update({f"{owner}.{key}": np.zeros(3, dtype=np.float32) for key in POSE_KEYS})
         return result
+
+    def parameter_names(self) -> set[str]:
+        """Return all names that `parameters=` takes: those of `parameters()`, and `"thickness"` for all objects."""
+        names = {f"{item.name}.{key}" for item in self.objects for key in (*PARAMETER_KEYS, *POSE_KEYS)}
+        return {"beta", "thickness", *names, *(f"{CAMERA}.{key}" for key in POSE_KEYS)}
+
+
+def multiple_of_p(text: str) -> float | None:
+    """Return the number of a thickness in multiples of P(z), 2 of "2P"; None for any other text."""
+    match = _MULTIPLE_OF_P.fullmatch(text)
+    return None if match is None else float(match[1])
 
 
 def check_parameter(item: SceneObject, key: str, value: Any, camera: Camera | None = None) -> None:

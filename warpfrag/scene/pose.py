@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from warpfrag.scene.objects import Scene
 
 POSE_KEYS = ("translation", "rotation")
+# Whose parameters are the camera's; no object may be named so.
+CAMERA = "camera"
 
 RADIANS = math.pi / 180.0
 # Below an angle of 1 the ratios are power series, of as many terms as float64 can tell.
@@ -122,12 +124,12 @@ def pose_matrix(
     """
     owner, _, key = name.rpartition(".")
     owned = [item for item in scene.objects if item.name == owner]
-    if key not in POSE_KEYS or not (owned or owner == "camera"):
+    if key not in POSE_KEYS or not (owned or owner == CAMERA):
         raise ValueError(
             f"name: found {shorten(name)}, expected the translation or rotation of an object or the camera"
         )
     translation, rotation = pose_values(owner, parameters or {})
-    camera_translation, camera_rotation = pose_values("camera", parameters or {})
+    camera_translation, camera_rotation = pose_values(CAMERA, parameters or {})
     view = (camera or scene.camera).view_matrix()
     turned = rotation_matrix(camera_rotation).T
     by_force, by_torque = np.zeros((3, 3)), np.zeros((3, 3))
@@ -185,8 +187,8 @@ def posed(scene: "Scene", parameters: Mapping[str, Any]) -> "Scene":
             motion[:3, 3] = item.middle() - rotation @ item.middle() + translation
             objects[index] = replace(item, matrix=motion @ item.matrix)
     camera = scene.camera
-    if "camera" in owners:
-        translation, vector = pose_values("camera", parameters)
+    if CAMERA in owners:
+        translation, vector = pose_values(CAMERA, parameters)
         axes = camera.view_matrix()[:3, :3].T
         _, down, forward = (axes @ rotation_matrix(vector)).T
         eye = camera.eye + axes @ translation
