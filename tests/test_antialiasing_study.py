@@ -1,27 +1,21 @@
 """The antialiasing study's footprints and its band, on planes, where both are known."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
+from study_modules import EXPERIMENTS, study_modules
 
 import warpfrag as wf
 
-FOLDER = Path(__file__).parents[1] / "experiments" / "fit" / "antialiasing"
+FOLDER = EXPERIMENTS / "fit" / "antialiasing"
 EYE, SIZE = (0.3, 0.2, 5.0), (24, 20)
 FACES = np.array([[0, 1, 2], [0, 2, 3]])
 
 
 @pytest.fixture(scope="module")
 def footprint():
-    """The study's module, which is no part of the package."""
-    sys.path.insert(0, str(FOLDER))
-    try:
-        yield __import__("footprint")
-    finally:
-        sys.path.remove(str(FOLDER))
-        sys.modules.pop("footprint", None)
+    """The study's module."""
+    with study_modules(FOLDER, ["footprint"]) as modules:
+        yield modules.footprint
 
 
 def plane(name, rise):

@@ -1,33 +1,22 @@
 """The study of layer budgets: what a surface among layers hides, the search by pixel, and the rule."""
 
-import sys
-from pathlib import Path
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
+from study_modules import EXPERIMENTS, study_modules
 
 import warpfrag as wf
 
 torch = pytest.importorskip("torch")
 pytest.importorskip("matplotlib")
 
-FOLDER = Path(__file__).parents[1] / "experiments" / "fit" / "layer_budgets"
-# Those it brings along from the study of transparency too.
-MODULES = ("budget", "deep_scenes", "maps", "shapes")
+FOLDER = EXPERIMENTS / "fit" / "layer_budgets"
 
 
 @pytest.fixture(scope="module")
 def study():
-    """The study's modules, which are no part of the package."""
-    before = list(sys.path)
-    sys.path.insert(0, str(FOLDER))
-    try:
-        yield SimpleNamespace(**{name: __import__(name) for name in ("budget", "deep_scenes", "maps")})
-    finally:
-        sys.path[:] = before
-        for name in MODULES:
-            sys.modules.pop(name, None)
+    """The study's modules, and those of the study of transparency that they bring along."""
+    with study_modules(FOLDER, ("budget", "deep_scenes", "maps"), ["shapes"]) as modules:
+        yield modules
 
 
 @pytest.fixture(scope="module")

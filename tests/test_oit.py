@@ -1,30 +1,23 @@
 """The transparency study: its generated shapes are what they claim to be, and its functions run, figures included."""
 
 import json
-import sys
-from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from study_modules import EXPERIMENTS, study_modules
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("scipy")
 
-FOLDER = Path(__file__).parents[1] / "experiments" / "oit"
+FOLDER = EXPERIMENTS / "oit"
 MODULES = ("figures", "methods", "shapes", "study", "study_scenes", "tables")
 
 
 @pytest.fixture(scope="module")
 def oit():
-    """The study's modules, which are no part of the package."""
-    sys.path.insert(0, str(FOLDER))
-    try:
-        yield SimpleNamespace(**{name: __import__(name) for name in MODULES})
-    finally:
-        sys.path.remove(str(FOLDER))
-        for name in MODULES:
-            sys.modules.pop(name, None)
+    """The study's modules."""
+    with study_modules(FOLDER, MODULES) as modules:
+        yield modules
 
 
 @pytest.fixture(scope="module")

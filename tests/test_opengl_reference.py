@@ -1,31 +1,24 @@
 """The reference of the OpenGL study: pyrender's image of flat-coloured faces is ours, sample by sample."""
 
 import importlib.util
-import sys
 from dataclasses import replace
-from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from study_modules import EXPERIMENTS, study_modules
 
 import warpfrag as wf
 
-FOLDER = Path(__file__).parents[1] / "experiments" / "fit" / "opengl"
+FOLDER = EXPERIMENTS / "fit" / "opengl"
 MODULES = ("comparison", "pyrender_image")
 SIZE, SAMPLES = (40, 32), 8
 
 
 @pytest.fixture(scope="module")
 def study():
-    """The study's modules, which are no part of the package."""
-    sys.path.insert(0, str(FOLDER))
-    try:
-        yield SimpleNamespace(**{name: __import__(name) for name in MODULES})
-    finally:
-        sys.path.remove(str(FOLDER))
-        for name in MODULES:
-            sys.modules.pop(name, None)
+    """The study's modules."""
+    with study_modules(FOLDER, MODULES) as modules:
+        yield modules
 
 
 @pytest.fixture(scope="module")

@@ -20,6 +20,7 @@ from scipy.optimize import minimize_scalar  # noqa: E402
 
 import warpfrag as wf  # noqa: E402
 from warpfrag.fit import FitParameter, FitResult, Reference, Study  # noqa: E402
+from warpfrag.fit.losses import psnr  # noqa: E402
 from warpfrag.fit.summary import Figure, Summary, Table  # noqa: E402
 
 HERE = Path(__file__).parent
@@ -122,8 +123,7 @@ class Case:
 
     def psnr(self, image: np.ndarray, mask: np.ndarray | None = None) -> float:
         """Return the peak signal-to-noise ratio in linear light, of all pixels or of some [dB]."""
-        error = self.error(image)
-        return float(-10.0 * np.log10((error if mask is None else error[mask]).mean()))
+        return psnr(image, self.reference, mask)
 
     def by_rule(self, rule: str, factor: float, beta: float = 1.0) -> np.ndarray:
         """Return the image whose thickness is a multiple of a footprint."""

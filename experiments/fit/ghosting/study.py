@@ -18,6 +18,7 @@ from target import MODULATION, Target, make_target  # noqa: E402
 
 import warpfrag as wf  # noqa: E402
 from warpfrag.fit import Reference, Study, load_study  # noqa: E402
+from warpfrag.fit.losses import psnr  # noqa: E402
 from warpfrag.fit.summary import Figure, Summary, Table  # noqa: E402
 from warpfrag.images import write_image  # noqa: E402
 
@@ -100,9 +101,7 @@ def maps_of(found: dict[str, dict[str, Any]], scene: wf.Scene) -> dict[str, np.n
 
 def decibels(image: np.ndarray, target: Target) -> dict[str, float]:
     """Return the peak signal-to-noise ratio of each area [dB], against a peak of 1 in linear light."""
-    square = ((image[..., :3] - target.image).astype(np.float64) ** 2).mean(axis=-1)
-    with np.errstate(divide="ignore"):
-        return {name: float(-10.0 * np.log10(square[area].mean())) for name, area in target.areas.items()}
+    return {name: psnr(image, target.image, area) for name, area in target.areas.items()}
 
 
 def report(target: Target, scene: wf.Scene, images: dict[str, np.ndarray], found: dict[str, dict[str, Any]]) -> None:

@@ -6,15 +6,11 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 import warpfrag as wf
+from warpfrag.fit.losses import psnr
 from warpfrag.images import linear_to_srgb
 
 STYLE = {"font.size": 9, "axes.titlesize": 9, "axes.spines.top": False, "axes.spines.right": False}
 COLORS = {"pyrender": "#1f78b4", "ours": "#ff7f00"}
-
-
-def psnr(image: np.ndarray, reference: np.ndarray, mask: np.ndarray) -> float:
-    """Return the peak signal-to-noise ratio of some pixels' colours in linear light [dB]."""
-    return float(-10.0 * np.log10(np.square(image[..., :3] - reference, dtype=np.float64)[mask].mean()))
 
 
 def by_thickness(scene: wf.Scene, references: dict[str, np.ndarray], band: np.ndarray) -> dict[str, np.ndarray]:

@@ -20,6 +20,7 @@ from comparison import Comparison, NoOpenGLError, compare, on_grid  # noqa: E402
 
 import warpfrag as wf  # noqa: E402
 from warpfrag.fit import FitParameter, FitResult, Reference, Study  # noqa: E402
+from warpfrag.fit.losses import psnr  # noqa: E402
 from warpfrag.fit.summary import Figure, Summary, Table  # noqa: E402
 from warpfrag.images import write_image  # noqa: E402
 
@@ -110,7 +111,7 @@ def summarise(
     levels = []
     for name, image in images.items():
         words = "no merging" if name == "none" else f"rule, t = {factor:.2f}·|g₁ − g₂|"
-        levels.append((words, "–", "–", *(f"{figures.psnr(image, references[r], band):.2f}" for r in references)))
+        levels.append((words, "–", "–", *(f"{psnr(image, references[r], band):.2f}" for r in references)))
     apart = []
     for kind, words in KINDS.items():
         one, other = (fits[name][kind] for name in references)
@@ -121,7 +122,7 @@ def summarise(
             apart += [abs(one.found[key] / other.found[key] - 1.0) for key in one.found]
         else:
             thick = ["map", "map"]
-        cells = [f"{figures.psnr(fits[name][kind].after, references[name], band):.2f}" for name in references]
+        cells = [f"{psnr(fits[name][kind].after, references[name], band):.2f}" for name in references]
         levels.append((words, *(f"{t}, β {b:.3f}" for t, b in zip(thick, values, strict=True)), *cells))
     pair, snapped = compared.values()
     outside = 255.0 * snapped.residual[~snapped.crossing].max()
@@ -139,7 +140,7 @@ def summarise(
         "samples that differ": int(pair.differing.sum()),
         "thickness, pyrender": fits["pyrender"]["scene"].found["thickness"],
         "thickness, ours": fits["ours"]["scene"].found["thickness"],
-        "rule, pyrender [dB]": figures.psnr(images["rule"], references["pyrender"], band),
+        "rule, pyrender [dB]": psnr(images["rule"], references["pyrender"], band),
     }
     where = ("samples that differ", "largest residual", "pixels over 1/255")
     head = ("vertices", *(f"{words}, outside" for words in where), *(f"{words}, at intersections" for words in where))
