@@ -74,7 +74,10 @@ def run(tmp_path):
         title="Speckle & <co>",
         question="Which **multiple** <b>?",
         answer="Twice & more.",
-        tables=(Table(("depth", "name"), ((1.5, "<i>|"),), caption="By depth."),),
+        tables=(
+            Table(("depth", "name"), ((1.5, "<i>|"),), caption="By depth."),
+            Table(("far",), ((2.5,),), further=True),
+        ),
         figures=(Figure("figures/shown.png", "Speckle *by* depth"), Figure("figures/other.png", 'The "other" <one>')),
         command="uv run python study.py",
     )
@@ -121,6 +124,16 @@ def test_report_shows_the_study(run, tmp_path):
     assert "a remark" not in text
     assert text.count("uv run python study.py") == 1
     assert str(tmp_path) not in text
+
+
+def test_further_numbers_are_folded(run, tmp_path):
+    """What the README folds, the report folds too."""
+    _, text = write([run], tmp_path)
+    Page(text)
+    inside = text.split("<details>\n<summary>Further numbers</summary>\n")[1].split("</details>")[0]
+    assert '<td style="text-align:right">2.5</td>' in inside
+    assert "By depth." not in inside
+    assert "Meaning" not in inside
 
 
 def test_command_is_shown_if_the_readme_does_not(run, tmp_path):

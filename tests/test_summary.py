@@ -1,5 +1,6 @@
 """What a study has found: written to its README and read back, whole or not at all."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -61,6 +62,15 @@ def test_column_of_numbers(cells, right):
     """A column is one of numbers if all that is not empty is a number, perhaps with a short unit."""
     rule = Table(("c",), tuple((cell,) for cell in cells)).markdown().splitlines()[1]
     assert rule.endswith(": |") == right
+
+
+def test_further_tables_are_folded():
+    """The answer and the main tables are read at once; the others stand after them, in one part that opens."""
+    further = (Table(("b",), ((2,),), caption="More.", further=True), Table(("c",), ((3,),), further=True))
+    text = replace(SUMMARY, tables=(further[0], *SUMMARY.tables, further[1])).markdown()
+    before, rest = text.split("<details>\n<summary>Further numbers</summary>\n\n")
+    assert before == f"{SUMMARY.markdown()}\n\n"
+    assert rest == "\n\n".join([*(table.markdown() for table in further), "</details>"])
 
 
 def test_save_rewrites_the_marked_part(folder):

@@ -21,6 +21,8 @@ from warpfrag.saving import replacing
 from warpfrag.versions import package_versions
 
 _EXTERNAL = re.compile(r"[a-z][a-z0-9+.-]*:", re.IGNORECASE)
+# The only HTML in a README that the report takes over: parts that are folded.
+_FOLD = re.compile(r"^(<details>\s*<summary>[^<]*</summary>|</details>)$", re.MULTILINE)
 _COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
 # Said to the browser too, so that nothing that slips through is loaded.
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
@@ -104,7 +106,8 @@ def _section(folder: Path, summary: Summary) -> str:
     text = _COMMENT.sub("", f"{before}\n\n{summary.markdown()}\n\n{after}")
     markdown = _markdown(folder, summary)
     shown: dict[str, set[Path]] = {"files": set()}
-    parts = [markdown.render(text, shown)]
+    # Split by a group, what opens and closes a fold stands at odd places.
+    parts = [f"{part}\n" if place % 2 else markdown.render(part, shown) for place, part in enumerate(_FOLD.split(text))]
     for figure in summary.figures:
         if (folder / figure.path).resolve() not in shown["files"]:
             parts.append(_figure(folder / figure.path, figure.caption, markdown.renderInline(figure.caption)))

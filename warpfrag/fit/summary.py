@@ -19,6 +19,8 @@ import numpy as np
 from warpfrag.saving import replacing
 
 BEGIN, END = "<!-- results: begin (written by study.py) -->", "<!-- results: end -->"
+# Opens the folded part of a README.
+FURTHER = "<details>\n<summary>Further numbers</summary>"
 README, NUMBERS, SUMMARY = "README.md", "numbers.json", "summary.json"
 RESULTS = Path("results") / "fit"
 # Significant digits of a number in a table or in numbers.json: fewer than float32 has.
@@ -44,11 +46,13 @@ class Table:
         columns: heads of the columns.
         rows: cells by row; text may hold inline Markdown, and floats are shown to 6 significant digits.
         caption: a sentence that stands above the table; may be empty.
+        further: whether it stands with others of its kind in a part that is folded until somebody wants it.
     """
 
     columns: tuple[str, ...]
     rows: tuple[tuple[Cell, ...], ...]
     caption: str = ""
+    further: bool = False
 
     def __post_init__(self):
         columns = tuple(str(column) for column in self.columns)
@@ -123,8 +127,12 @@ class Summary:
         object.__setattr__(self, "numbers", {name: _number(name, value) for name, value in self.numbers.items()})
 
     def markdown(self) -> str:
-        """Return what the README shows between its markers: the answer and the tables."""
-        return "\n\n".join([self.answer.strip(), *(table.markdown() for table in self.tables)])
+        """Return what the README shows between its markers: the answer and the tables, some of them folded."""
+        parts = [self.answer.strip(), *(table.markdown() for table in self.tables if not table.further)]
+        further = [table.markdown() for table in self.tables if table.further]
+        if further:
+            parts += [FURTHER, *further, "</details>"]
+        return "\n\n".join(parts)
 
     def save(self, folder: str | os.PathLike, *, results: str | os.PathLike = RESULTS) -> None:
         """Write `numbers.json` and the README's marked part, and `summary.json` to the results: all or nothing.

@@ -78,6 +78,19 @@ def smallest_multiple(pair: Pair, buffer: str, way: str) -> float:
     return high
 
 
+def clear_from(pair: Pair, buffer: str, way: str, multiples: Sequence[float]) -> float:
+    """Return the smallest of ascending multiples from which on no plane speckles; 0 where none of them does.
+
+    Planes that are apart speckle where the thickness is about their distance, and need not where it is less.
+    """
+    clear = 0.0
+    for multiple in reversed(multiples):
+        if np.mean(deviation(pair, buffer, multiple, *WAYS[way]) > VISIBLE) > FEW:
+            return clear
+        clear = multiple
+    return 0.0
+
+
 def examine(setting: Setting, buffers: Sequence[str] = BUFFERS, ways: Sequence[str] = ("OFM", "SFM")) -> Case:
     """Find the smallest multiples of a setting."""
     pair = make_pair(setting)
