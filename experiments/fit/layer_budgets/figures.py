@@ -17,7 +17,8 @@ LINES = {
     "2P": ("t = 2P", "#9e9e9e", "o-"),
     "100P": ("t = 100P", "#616161", "s-"),
     "one value": ("one value, fitted", "#1f78b4", "^-"),
-    "gradient": ("map, by gradient", "#6a3d9a", "v:"),
+    "together": ("map, by gradient", "#6a3d9a", "v-"),
+    "on the way": ("best that gradients pass by", "#cab2d6", "v:"),
     RULES[0]: ("rule, factor of the machine", "#e31a1c", "D-"),
     "blocks": (f"map, {BLOCK}² blocks", "#33a02c", "P--"),
     "pixels": ("best possible per pixel", "#000000", "*--"),
@@ -106,7 +107,7 @@ def maps(found: Any) -> Figure:
     chosen = found.choices[key]
     panels = {
         "by the rule": chosen[RULES[0]],
-        "by gradient, from one value": chosen["gradient"],
+        "by gradient, from one value": chosen["together"],
         f"by search, {BLOCK}² blocks": chosen["blocks"],
         "by search, per pixel": chosen["pixels"],
     }

@@ -17,9 +17,10 @@ WAYS = {
     "2P": "2P",
     "100P": "100P",
     "one value": "one value, fitted",
-    "gradient": "map, by gradient",
+    "together": "map, by gradient",
     RULES[0]: "rule",
     "blocks": f"map, {BLOCK}² blocks",
+    "on the way": "best that gradients pass by",
     "pixels": "best possible per pixel",
 }
 # Beyond this it is float32 that rounds, not the method.
@@ -45,14 +46,14 @@ def save(measured: Sequence[Any], factors: dict[str, float]) -> None:
         for way in ("100P", "one value", RULES[0], "blocks", "pixels"):
             numbers[f"{one.case.name}, {way}: mean PSNR"] = one.mean_psnr(way)
     for key in (("SFM", "inserted", 4), ("SKB+OFM", "image", 4), ("SKB+OFM", "inserted", 4)):
-        for way in ("2P", "100P", "one value", "gradient", RULES[0], "pixels"):
+        for way in ("2P", "100P", "one value", "together", RULES[0], "pixels"):
             numbers[f"{key[0]}, {key[1]}, M = {key[2]}, {way}: PSNR"] = psnr(fitted.scores[key][way]["rms"])
     Summary(
         name="layer_budgets",
         title="Layer budgets",
         question="Which z-thickness makes 2, 4 or 8 merged layers stand for all fragments of a deep scene?",
         answer=answer(measured, factors),
-        tables=(decibels(fitted), levels(fitted), by_scene(measured, factors)),
+        tables=(by_scene(measured, factors), decibels(fitted), levels(fitted), best_factors(measured, factors)),
         figures=(
             Figure("figures/errors.png", "Error against the number of layers, by scene and method."),
             Figure("figures/images.png", "The machine in four layers by several thicknesses, and the errors."),
@@ -74,19 +75,13 @@ def answer(measured: Sequence[Any], factors: dict[str, float]) -> str:
     def gains(way: str) -> str:
         return " / ".join(f"{_gain(one, way):.1f}" for one in measured)
 
-    def shares(way: str) -> str:
-        return " / ".join(f"{100.0 * _gain(one, RULES[0]) / _gain(one, way):.0f}" for one in measured)
-
     return (
-        "For the image alone the methods that sort want no thickness: at t = 0 their tail, an over in order, makes the "
-        f"image exact for every M, and 100P costs SFM and exact merging up to {worst:.2f} levels of 255 (rms). "
-        "SKB+OFM, and every method once a surface is put among its layers, want one, and not the same for every scene: "
-        f"for SFM, M = 4, the best single value is {values} P(z) ({names}). In the mean of these methods and "
-        f"M = 2, 4, 8 the best thickness of each pixel gains {gains('pixels')} dB over 100P, a map of {BLOCK}² blocks "
-        f"{gains('blocks')}, and the best single values of each scene {gains('one value')}. The rule t = "
-        f"min({factors[RULES[0]]:.2f}·extent/M, the M-th largest gap), its factor found on the machine alone, gains "
-        f"{gains(RULES[0])} dB: {shares('blocks')} % of what the map of blocks does, {shares('pixels')} % of what is "
-        "possible."
+        "For the image alone the methods that sort want no thickness: their tail, an over in order, makes it exact for "
+        f"every M, and 100P costs them up to {worst:.2f} levels of 255 (rms). SKB+OFM, and every method once a surface "
+        f"is put among its layers, want one, and not the same for every scene: {values} P(z) ({names}; SFM, M = 4). "
+        f"The rule t = min({factors[RULES[0]]:.2f}·extent/M, the M-th largest gap), its factor found on the machine "
+        f"alone, gains {gains(RULES[0])} dB over 100P; a map of {BLOCK}² blocks {gains('blocks')}, the best thickness "
+        f"of each pixel {gains('pixels')}."
         f"\n\n{gradients(fitted)}"
     )
 
@@ -99,16 +94,16 @@ def gradients(found: Any) -> str:
         values = [psnr(found.scores[key][way]["rms"]) - psnr(found.scores[key][start]["rms"]) for key in keys]
         return " / ".join(f"{value:.1f}" for value in values)
 
+    together, passed, searched = (
+        gains("SFM", "inserted", way, "one value") for way in ("together", "on the way", "pixels")
+    )
     moved = max(found.moved["SKB+OFM", "image", count] for count in BUDGETS)
-    inserted = found.moved["SFM", "inserted", 4]
     return (
-        "Gradients hold fixed what merges. SKB+OFM's image is piecewise constant in t, as its mix does not ask how far "
-        f"slabs overlap: gradients move {100.0 * moved:.0f} % of its pixels, and only search finds anything. With a "
-        f"surface inserted they move {100.0 * inserted:.0f} % (SFM, M = 4). From the best single value Adam gains "
-        f"{gains('SFM', 'inserted', 'gradient, together', 'one value')} dB for M = 2 / 4 / 8 if all pixels stop at the "
-        f"same step, {gains('SFM', 'inserted', 'gradient', 'one value')} dB if each keeps the best that it came past "
-        f"(search: {gains('SFM', 'inserted', 'pixels', 'one value')}). For SFM's image, best at t = 0, `study.toml` "
-        f"and its like gain {gains('SFM', 'image', 'gradient', '100P')} dB from 100P."
+        f"With a surface inserted a map fitted by gradient gains {together} dB over the best single value (SFM, M = "
+        f"2 / 4 / 8); the best that each pixel passes by on the way {passed}, search {searched}. SKB+OFM's image is "
+        f"piecewise constant in t: gradients move {100.0 * moved:.0f} % of its pixels. For SFM's image `study.toml` "
+        f"and its like gain {gains('SFM', 'image', 'together', '100P')} dB from 100P and stay "
+        f"{gains('SFM', 'image', '2P', 'together')} dB short of 2P: its best is t = 0, far away for a logarithm."
     )
 
 
@@ -120,6 +115,8 @@ def decibels(found: Any) -> Table:
     """Return the PSNR of the fitted scene by method, measure and way of choosing, for every number of layers."""
 
     def cell(method: str, measure: str, way: str) -> str:
+        if way not in found.scores[method, measure, BUDGETS[0]]:
+            return "–"
         values = [psnr(found.scores[method, measure, count][way]["rms"]) for count in BUDGETS]
         if min(values) > EXACT:
             return f"> {EXACT:.0f}"
@@ -131,13 +128,15 @@ def decibels(found: Any) -> Table:
         for method in METHODS
     ]
     caption = "PSNR [dB] of the machine for M = 2 / 4 / 8: of the image, and with a surface inserted."
-    return Table(("method", "measure", *WAYS.values()), tuple(rows), caption)
+    return Table(("method", "measure", *WAYS.values()), tuple(rows), caption, further=True)
 
 
 def levels(found: Any) -> Table:
     """Return mean and 99th percentile of the absolute error of the fitted scene."""
 
     def cell(method: str, measure: str, way: str, kind: str, form: str) -> str:
+        if way not in found.scores[method, measure, BUDGETS[0]]:
+            return "–"
         return " / ".join(format(found.scores[method, measure, count][way][kind], form) for count in BUDGETS)
 
     rows = [
@@ -146,7 +145,7 @@ def levels(found: Any) -> Table:
         for kind, words, form in (("mean", "mean", ".2f"), ("p99", "99 %", ".0f"))
     ]
     caption = "Mean and 99th percentile of the absolute error [levels of 255, linear light], M = 2 / 4 / 8."
-    return Table(("method", "measure", "", *WAYS.values()), tuple(rows), caption)
+    return Table(("method", "measure", "", *WAYS.values()), tuple(rows), caption, further=True)
 
 
 def by_scene(measured: Sequence[Any], factors: dict[str, float]) -> Table:
@@ -173,3 +172,20 @@ def by_scene(measured: Sequence[Any], factors: dict[str, float]) -> Table:
         "M = 2, 4, 8."
     )
     return Table(("scene", "fragments: mean, most", *columns.values()), tuple(rows), caption)
+
+
+def best_factors(measured: Sequence[Any], factors: dict[str, float]) -> Table:
+    """Return the rule's best factors by scene and number of layers, and what the one of the machine loses."""
+    rows = []
+    for one in measured:
+        cells = []
+        for count in BUDGETS:
+            low, high = one.factors(RULES[0], count)
+            cells += [f"{low:.2f} … {high:.2f}", f"{one.lost(RULES[0], factors[RULES[0]], count):.1f}"]
+        rows.append((one.case.name, *cells))
+    columns = [name for count in BUDGETS for name in (f"M = {count}", f"{factors[RULES[0]]:.2f} loses [dB]")]
+    caption = (
+        "The rule's factor that is best for a method and measure, least and largest; and the most that the one factor "
+        "loses against it."
+    )
+    return Table(("scene", *columns), tuple(rows), caption, further=True)

@@ -64,6 +64,17 @@ class Measured:
         logarithms = np.log([self.rules[rule][key] for key in self.keys()])
         return float(FACTORS[logarithms.mean(axis=0).argmin()])
 
+    def factors(self, rule: str, layer_count: int) -> tuple[float, float]:
+        """Return the least and the largest factor that is best for one method and measure."""
+        best = [FACTORS[self.rules[rule][key].argmin()] for key in self.keys() if key[2] == layer_count]
+        return float(min(best)), float(max(best))
+
+    def lost(self, rule: str, factor: float, layer_count: int) -> float:
+        """Return the most that a factor loses against the best one of a method and measure [dB]."""
+        place = int(np.abs(FACTORS - factor).argmin())
+        rows = [self.rules[rule][key] for key in self.keys() if key[2] == layer_count]
+        return max(psnr(errors.min()) - psnr(errors[place]) for errors in rows)
+
     def multiple(self, key: Key) -> float:
         """Return the best single value in multiples of the mean P(z)."""
         return self.one[key] * (self.case.span[1] - self.case.span[0]) / self.case.resolution
@@ -145,12 +156,12 @@ def by_gradient(found: Measured) -> None:
             changed = ~np.isclose(result.found["thickness"], result.start["thickness"], rtol=1e-6).reshape(-1)
             found.moved[key] = float(changed[case.covered].mean())
             after = torch.as_tensor(result.after[..., :3].reshape(-1, 1, 3))
-            found.scores[key]["gradient"] = case.score(after - case.reference[:, -1:])
+            found.scores[key]["together"] = case.score(after - case.reference[:, -1:])
             key = method, "inserted", layer_count
             descent = descend(case, method, layer_count, max(found.one[key] * depth, thin), STEPS)
             found.moved[key] = descent.moved
-            found.score(key, "gradient", descent.pixels)
-            found.score(key, "gradient, together", descent.together)
+            found.score(key, "together", descent.together)
+            found.score(key, "on the way", descent.pixels)
         print(f"{case.name}: {method} fitted", flush=True)
 
 
