@@ -7,7 +7,7 @@ import numpy as np
 from warpfrag.scene.objects import SceneObject
 from warpfrag.scene.points import PointSet, spacing, surfels
 
-# Rim of the discs [spacings] and its corners: those of the library's surfels.
+# Rim of discs that fall off [spacings], and corners of all: those of the library's surfels.
 RIM, SEGMENTS = 2.0, 8
 RINGS = 2
 
@@ -18,17 +18,19 @@ class Discs:
 
     Attributes:
         points: with normals and colours.
+        rim: distance of the rim from the centre [spacings].
         spacing: mean distance from a point to its nearest neighbour [scene units].
         radii: distance of each of a disc's vertices from its centre [spacings], (V,).
     """
 
     points: PointSet
+    rim: float = RIM
     spacing: float = field(init=False)
     radii: np.ndarray = field(init=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "spacing", spacing(self.points.points))
-        rings = RIM * np.arange(1, RINGS + 1) / RINGS
+        rings = self.rim * np.arange(1, RINGS + 1) / RINGS
         object.__setattr__(self, "radii", np.concatenate([[0.0], np.repeat(rings, SEGMENTS)]))
 
     def falloff(self, radius: float) -> np.ndarray:
@@ -43,7 +45,7 @@ class Discs:
             thickness: of all [P(z)].
         """
         assert self.points.color is not None
-        rim = surfels(self.points, RIM, SEGMENTS).vertices.reshape(-1, SEGMENTS, 3)
+        rim = surfels(self.points, self.rim, SEGMENTS).vertices.reshape(-1, SEGMENTS, 3)
         centre = self.points.points[:, None]
         rings = [centre + share * (rim - centre) for share in np.arange(1, RINGS + 1) / RINGS]
         vertices = np.concatenate([centre, *rings], axis=1)

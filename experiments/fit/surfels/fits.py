@@ -46,11 +46,13 @@ class Setting:
 
     Attributes:
         study: how to fit, with cameras and references.
-        discs: of the points.
+        discs: of the points, large enough to fall off.
+        opaque: of the points, of the size that suits opaque ones.
     """
 
     study: Study
     discs: Discs
+    opaque: Discs
 
     @property
     def spacing(self) -> float:
@@ -65,8 +67,11 @@ class Setting:
 
     def scene(self, discs: str, thickness: float, merge: Merge = "smooth") -> Scene:
         """Return the scene of the discs, their thickness in multiples of P(z)."""
-        opacity = np.ones_like(self.discs.radii) if discs == OPAQUE else self.discs.falloff(RADIUS)
-        return replace(self.study.scene, objects=[self.discs.item(opacity, thickness)], merge=merge)
+        if discs == OPAQUE:
+            item = self.opaque.item(np.ones_like(self.opaque.radii), thickness)
+        else:
+            item = self.discs.item(self.discs.falloff(RADIUS), thickness)
+        return replace(self.study.scene, objects=[item], merge=merge)
 
     def draw(self, discs: str, thickness: float) -> Row:
         """Draw the discs in the colours of the mesh."""

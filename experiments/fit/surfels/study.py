@@ -4,7 +4,8 @@ Draws figures/, and writes points.ply, views/ and the numbers of README.md.
 """
 
 import argparse
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from tied import Tied, fit_tied  # noqa: E402
 
 import warpfrag as wf  # noqa: E402
 from warpfrag.capture.coverage import Coverage  # noqa: E402
-from warpfrag.fit import Reference, load_study  # noqa: E402
+from warpfrag.fit import Progress, Reference, load_study  # noqa: E402
 from warpfrag.fit.losses import psnr  # noqa: E402
 from warpfrag.fit.summary import Figure, Summary, Table  # noqa: E402
 from warpfrag.images import write_image  # noqa: E402
@@ -31,8 +32,13 @@ HERE = Path(__file__).parent
 COMMAND = "uv run python experiments/fit/surfels/study.py"
 POINTS = 2000
 # Thicknesses [spacings] and numbers of points of the curves, the latter as shares of the study's.
-MULTIPLES = np.geomspace(1e-3, 10.0, 17)
+MULTIPLES = np.geomspace(1e-3, 30.0, 19)
 SHARES = (0.25, 1.0, 4.0)
+# Rims of opaque discs that are tried [spacings].
+RIMS = (0.8, 1.0, 1.1, 1.2, 1.4, 1.6, 2.0)
+# Of the views to fit those that judge learning rates and numbers of steps; study.toml has the best.
+JUDGES = ("side_4", "side_8")
+RATES, STEPS = (0.00375, 0.0075, 0.015), (75, 150, 300)
 MERGES: dict[Merge, str] = {"none": "plain over", "smooth": "SFM", "order_independent": "OFM", "exact": "exact"}
 ALL = ("color", "opacity", "thickness")
 CAPTION = "Mean PSNR [dB] of whole images in linear light, {} views that are fitted and {} that are held out:"
@@ -49,6 +55,7 @@ def main() -> None:
     setting = prepare(mesh, arguments.size, arguments.steps, arguments.points)
     if arguments.size is None and arguments.points == POINTS:
         write_inputs(setting)
+    tuned = tune(setting)
     rows, tied = fit_all(setting)
     ways: tuple[Merge, ...] = ("smooth", "order_independent", "exact")
     curves = {(discs, merge): curve(setting, discs, merge) for discs in (OPAQUE, FALLOFF) for merge in ways}
@@ -59,7 +66,7 @@ def main() -> None:
     (HERE / "figures").mkdir(exist_ok=True)
     figures.images(setting, rows).savefig(HERE / "figures" / "images.png", dpi=150)
     figures.curves(setting, rows, tied, MULTIPLES, curves, by_count).savefig(HERE / "figures" / "curves.png", dpi=150)
-    summarise(setting, rows, tied).save(HERE)
+    summarise(setting, rows, tied, tuned).save(HERE)
 
 
 def prepare(mesh: Mesh, size: int | None, steps: int | None, count: int) -> Setting:
@@ -70,7 +77,9 @@ def prepare(mesh: Mesh, size: int | None, steps: int | None, count: int) -> Sett
         camera = view.camera if size is None else view.camera.resized((size, size))
         views.append(replace(view, camera=camera, reference=Reference(render_mesh(mesh, camera))))
     study = replace(study, views=views, reference=None, steps=steps or study.steps)
-    return Setting(study, Discs(sample_points(mesh, count)))
+    points = sample_points(mesh, count)
+    tried = [Setting(study, Discs(points), Discs(points, rim)) for rim in RIMS]
+    return max(tried, key=lambda each: mean_psnr(each.draw(OPAQUE, 0.0).images, each.views(held_out=False)))
 
 
 def write_inputs(setting: Setting) -> None:
@@ -79,6 +88,52 @@ def write_inputs(setting: Setting) -> None:
     (HERE / "views").mkdir(exist_ok=True)
     for view in setting.study.all_views:
         write_image(HERE / "views" / f"{view.name}.png", reference_of(view))
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """A learning rate and a number of steps, judged by views that are neither fitted nor held out.
+
+    Attributes:
+        levels: mean PSNR of these views, at 10 P(z) and with the thickness fitted [dB].
+        thickness: found [spacings].
+    """
+
+    levels: tuple[float, float]
+    thickness: float
+
+
+def tune(setting: Setting) -> dict[tuple[float, int], Tuned]:
+    """Fit colours and opacities without the judges, at every learning rate, and judge along the way."""
+    views = [replace(view, held_out=view.name in JUDGES) for view in setting.views(held_out=False)]
+    most = min(STEPS[-1], int(setting.study.steps or 0) * 2)
+    found = {}
+    for rate in RATES:
+        study = replace(setting.study, views=views, learning_rate=rate, steps=most + 1, patience=most + 1)
+        tuning = replace(setting, study=study)
+        paper = judged(tuning, ("color", "opacity"), PAPER)
+        free = judged(tuning, ALL, setting.spacing)
+        for steps in paper:
+            thickness = free[steps][1] / setting.spacing
+            found[rate, steps] = Tuned((paper[steps][0], free[steps][0]), thickness)
+            print(f"rate {rate:g}, {steps} steps: {found[rate, steps]}", flush=True)
+    return found
+
+
+def judged(setting: Setting, fitted: Sequence[str], thickness: float) -> dict[int, tuple[float, float]]:
+    """Fit, and return the mean PSNR of the views held out [dB] and the thickness [P(z)] after some of the steps."""
+    study, views, found = setting.study_of(FALLOFF, fitted, thickness), setting.views(held_out=True), {}
+
+    def look(progress: Progress) -> None:
+        # What is reported is what a step begins with.
+        if progress.step - 1 in STEPS:
+            values = {name: np.asarray(value, np.float32) for name, value in progress.parameters.items()}
+            images = {v.name: wf.render(study.scene, v.camera, parameters=values) for v in views}
+            now = float(values.get("points.thickness", thickness))
+            found[progress.step - 1] = mean_psnr(images, views), now
+
+    wf.fit(study, progress=look)
+    return found
 
 
 def fit_all(setting: Setting) -> tuple[dict[str, Row], Tied]:
@@ -126,7 +181,7 @@ def curve(setting: Setting, discs: str, merge: Merge) -> np.ndarray:
 
 def gaps(setting: Setting) -> np.ndarray:
     """Return how far the two nearest discs are apart in each pixel of the held-out views [P(z)]."""
-    camera, scene = setting.study.scene.camera, setting.scene(OPAQUE, 0.0)
+    camera, scene = setting.study.scene.camera, setting.scene(FALLOFF, 0.0)
     found = []
     for view in setting.views(held_out=True):
         fragments = wf.capture(scene, view.camera)
@@ -136,7 +191,7 @@ def gaps(setting: Setting) -> np.ndarray:
     return np.concatenate(found)
 
 
-def summarise(setting: Setting, rows: dict[str, Row], tied: Tied) -> Summary:
+def summarise(setting: Setting, rows: dict[str, Row], tied: Tied, tuned: dict[tuple[float, int], Tuned]) -> Summary:
     """Put the numbers into words and tables."""
     held_out, fitted = setting.views(held_out=True), setting.views(held_out=False)
     level = {name: mean_psnr(row.images, held_out) for name, row in rows.items()}
@@ -159,18 +214,22 @@ def summarise(setting: Setting, rows: dict[str, Row], tied: Tied) -> Summary:
     gain = np.subtract(merged, paper)
     low, middle, high = np.quantile(tied.radius, (0.25, 0.5, 0.75))
     answer = (
-        f"10 P(z) is not enough: it is {PAPER / spacing:.4f} spacings of the points, and of the pixels where discs "
-        f"overlap only {np.mean(apart < PAPER):.1%} have the two nearest within it (median {np.median(apart):.0f} "
-        f"P(z), {np.median(apart) / spacing:.2f} spacings); it changes plain over by "
-        f"{level['opaque, 10 P'] - level['opaque, over']:.2f} dB. Fitted with the colours, the thickness is "
+        f"10 P(z) is {PAPER / spacing:.4f} spacings of the points and changes plain over by "
+        f"{level['opaque, 10 P'] - level['opaque, over']:.2f} dB: of the pixels where discs overlap only "
+        f"{np.mean(apart < PAPER):.1%} have the two nearest within it. Fitted with the colours, the thickness is "
         f"{thick['opaque, color, t']:.1f} spacings for opaque discs, {thick['falloff, color, t']:.1f} for discs that "
         f"fall off, and {thick['all, t']:.1f} where opacities are fitted as well: "
         f"{level['opaque, color, t'] - level['opaque, color, 10 P']:+.1f}, "
         f"{level['falloff, color, t'] - level['falloff, color, 10 P']:+.1f} and {gain.mean():+.1f} dB in held-out "
-        f"views over the same fit at 10 P(z), the last better in {np.sum(gain > 0.0)} of {len(gain)} views "
-        f"({gain.min():+.1f} to {gain.max():+.1f} dB). All fitted: {level['all, t']:.1f} dB, from "
-        f"{level['opaque, over']:.1f} for opaque discs without merging. With one radius for each point its median is "
-        f"{middle:.2f} spacings (quartiles {low:.2f} and {high:.2f}), at {level['tied']:.1f} dB."
+        f"views over the same fit at 10 P(z), the last better in {np.sum(gain > 0.0)} of {len(gain)} views. All "
+        f"fitted: {level['all, t']:.1f} dB, from {level['opaque, over']:.1f} for opaque discs of the radius that suits "
+        f"them ({setting.opaque.rim:g} spacings). With one radius of falloff for each point its median is {middle:.2f} "
+        f"spacings (quartiles {low:.2f} and {high:.2f}), at {level['tied']:.1f} dB."
+    )
+    tuning = (
+        f"By learning rate and steps: mean PSNR of {' and '.join(JUDGES)} [dB], left out of these fits, at 10 P(z) / "
+        "with the thickness fitted (the thickness found [spacings]). The other fits take "
+        f"{setting.study.learning_rate:g} and {setting.study.steps} steps."
     )
     return Summary(
         name="surfels",
@@ -183,6 +242,12 @@ def summarise(setting: Setting, rows: dict[str, Row], tied: Tied) -> Summary:
                 cells,
                 CAPTION.format(len(fitted), len(held_out)),
             ),
+            Table(
+                ("learning rate", *(f"{steps} steps" for steps in STEPS)),
+                tuple((f"{rate:g}", *(tuning_cell(tuned.get((rate, steps))) for steps in STEPS)) for rate in RATES),
+                tuning,
+                further=True,
+            ),
         ),
         figures=(
             Figure("figures/images.png", "A held-out view by method, and its errors."),
@@ -192,9 +257,18 @@ def summarise(setting: Setting, rows: dict[str, Row], tied: Tied) -> Summary:
             **{f"{name} [dB]": value for name, value in level.items()},
             **{f"{name} [spacings]": thick[name] for name, row in rows.items() if "thickness" in row.fitted},
             "median radius [spacings]": float(middle),
+            "rim of opaque discs [spacings]": setting.opaque.rim,
         },
         command=COMMAND,
     )
+
+
+def tuning_cell(found: Tuned | None) -> str:
+    """Word what a learning rate and number of steps came to; None where it was not tried."""
+    if found is None:
+        return "–"
+    paper, free = found.levels
+    return f"{paper:.2f} / {free:.2f} ({found.thickness:.2g})"
 
 
 if __name__ == "__main__":
