@@ -80,3 +80,18 @@ def test_front_order_tells_who_is_in_front(study):
     objects = [wf.SceneObject("leaning", leaning, faces), wf.SceneObject("upright", upright, faces)]
     order = study.comparison.front_order(wf.Scene(camera, objects))
     np.testing.assert_array_equal(order, [[0, 1, -1, 0]])
+
+
+def test_unresolved_where_the_foremost_two_are_near(study):
+    """Planes 1 P(z) apart are unresolved, 3 P(z) apart and alone they are not; what is behind plays no part."""
+    camera = wf.Camera(eye=(0.0, 0.0, 4.0), target=(0.0, 0.0, 0.0), height=1.0, near=1.0, far=50.0, size=(3, 1))
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    step = float(wf.z_resolution(4.0, 1.0, 50.0))
+
+    def plane(name: str, left: float, right: float, z: float) -> wf.SceneObject:
+        corners = np.array([[left, -3, z], [right, -3, z], [right, 3, z], [left, 3, z]])
+        return wf.SceneObject(name, corners, faces)
+
+    # Columns are 1 wide and begin at -1.5: the first and second over columns 0 and 1, the third over 1 and 2.
+    objects = [plane("a", -2, 0.5, 0.0), plane("b", -2, -0.5, -step), plane("c", -0.5, 2, -3.0 * step)]
+    np.testing.assert_array_equal(study.comparison.unresolved(wf.Scene(camera, objects)), [[True, False, False]])

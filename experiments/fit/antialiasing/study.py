@@ -217,7 +217,11 @@ def render_all(case: Case, factors: dict[str, float]) -> None:
 
 
 def best_thickness(case: Case) -> dict[str, np.ndarray]:
-    """Search each crossing pixel for its best thickness, and return those that tell one, with their footprints."""
+    """Search each crossing pixel for its best thickness.
+
+    Returns:
+        "t" of those that tell it clearly, with their footprints by name; and "every ratio" of t to the rule's footprint.
+    """
     tried, owner = TRIED[:, None] * case.pixel_size, pixel_of(case.fragments)
     errors = np.stack([case.error(case.image(thickness[owner])).reshape(-1) for thickness in tried])
     best, pixel = errors.argmin(axis=0), np.arange(errors.shape[1])
@@ -228,7 +232,9 @@ def best_thickness(case: Case) -> dict[str, np.ndarray]:
     tells = case.crossing.reshape(-1) & (case.error(case.images["none"]).reshape(-1) > WRONG**2)
     tells &= (lowest < RIGHT**2) & (np.minimum(*around) > lowest + SENSITIVE**2)
     footprints = {name: values[tells] for name, values in case.footprints.items()}
-    return {"t": tried[best, pixel][tells], **footprints}
+    known = case.crossing.reshape(-1) & (case.footprints[RULE] > 0.0)
+    ratios = tried[best, pixel][known] / case.footprints[RULE][known]
+    return {"t": tried[best, pixel][tells], "every ratio": ratios, **footprints}
 
 
 def summarise(size: int, all_cases: list[Case], factors: dict[str, float], best: dict[str, Any]) -> Summary:
@@ -243,7 +249,7 @@ def summarise(size: int, all_cases: list[Case], factors: dict[str, float], best:
             (case.title, *(f"{case.psnr(case.images[m], getattr(case, mask) if mask else None):.1f}" for m in METHODS))
             for case in all_cases
         )
-        return Table(("", *METHODS.values()), rows, caption)
+        return Table(("", *METHODS.values()), rows, caption, further=mask is None)
 
     candidates = []
     for name, factor in factors.items():
@@ -269,13 +275,18 @@ def summarise(size: int, all_cases: list[Case], factors: dict[str, float], best:
     shown = ("none", "pixel size", "global", "rule")
     none, pixel, fitted_there, rule = (mean(others, lambda c, m=m: c.images[m]) for m in shown)
     low, middle, high = quartiles(best, RULE)
+    told = sum(len(data["t"]) for data in best.values())
+    every = np.concatenate([data["every ratio"] for data in best.values()])
+    everywhere = mean(others, lambda c: c.image(factors[RULE] * c.footprints[RULE][pixel_of(c.fragments)]))
     answer = (
         f"t = {factors[RULE]:.2f}·|g₁ − g₂| for both surfaces, where g is the gradient of a surface's depth along the "
         f"ray from pixel to pixel: the length of the *difference* of the two footprints, neither the pixel size nor "
-        f"either surface's own. Searched pixel by pixel, t/|g₁ − g₂| has median {middle:.2f} and quartiles {low:.2f} "
-        f"and {high:.2f}. Carried over to another view, resolution and scene, the rule reaches {rule:.1f} dB in the "
-        f"band around intersections (mean of {len(others)} images), against {fitted_there:.1f} with one thickness "
-        f"fitted to each of them, {pixel:.1f} with the pixel size and {none:.1f} unmerged."
+        f"either surface's own. In the {told:,} of {len(every):,} crossing pixels that tell their best thickness "
+        f"clearly, t/|g₁ − g₂| has median {middle:.2f} and quartiles {low:.2f} and {high:.2f} (median of all: "
+        f"{np.median(every):.2f}). Carried over to another view, resolution and scene, the rule reaches {rule:.1f} dB "
+        f"in the band around intersections (mean of {len(others)} images; {everywhere:.1f} if it sets every pixel's "
+        f"thickness), against {fitted_there:.1f} with one thickness fitted to each of them, {pixel:.1f} with the pixel "
+        f"size and {none:.1f} unmerged."
     )
     numbers = {
         "factor": factors[RULE],
@@ -285,7 +296,6 @@ def summarise(size: int, all_cases: list[Case], factors: dict[str, float], best:
         "pixel size [dB]": pixel,
         "none [dB]": none,
     }
-    told = sum(len(data["t"]) for data in best.values())
     return Summary(
         name="antialiasing",
         title="Antialiased intersections",
@@ -305,11 +315,13 @@ def summarise(size: int, all_cases: list[Case], factors: dict[str, float], best:
                 tuple(found),
                 "What the fits found, global, per object and per pixel [scene units]; how far the global fit of the "
                 "first view carries over; and the rule's factor fitted to each image by itself:",
+                further=True,
             ),
             Table(
                 ("β", *(f"A = {case.opacity:g}" for case in fitted)),
                 tuple(betas),
                 "PSNR of the band [dB] by β, thickness by the rule with its best factor (in brackets), first view:",
+                further=True,
             ),
         ),
         figures=(

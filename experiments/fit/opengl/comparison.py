@@ -14,6 +14,8 @@ import warpfrag as wf
 SCRIPT = Path(__file__).with_name("pyrender_image.py")
 # OpenGL rounds the projected corners of triangles to so many parts of a pixel (GL_SUBPIXEL_BITS is 8 here).
 PARTS = 256
+# Depths as near to each other as so many P(z) may come in either order: both are rounded.
+DEPTH_STEPS = 2.0
 # Two colours are the same sample's if they differ by less; colours come as 16 bits, half a step of which is 8e-6.
 SAME = 1e-4
 
@@ -30,7 +32,8 @@ class Comparison:
         theirs: by pyrender, mean of a pixel's samples, linear, (H, W, 3).
         ours: the same by us, plain sorted over.
         differing: samples of a pixel that show another colour, (H, W).
-        crossing: whether the front surfaces of two objects change places within the pixel, (H, W) bool.
+        crossing: whether within the pixel the front surfaces of two objects change places, or the two foremost ones are
+            nearer to each other than OpenGL's depth buffer resolves, (H, W) bool.
     """
 
     theirs: np.ndarray
@@ -61,6 +64,7 @@ def compare(scene: wf.Scene, samples: int) -> Comparison:
     means = [by_pixel(image).mean(axis=(1, 3), dtype=np.float64) for image in (theirs, ours)]
     order = by_pixel(front_order(fine))
     crossing = (order == 1).any(axis=(1, 3)) & (order == -1).any(axis=(1, 3))
+    crossing |= by_pixel(unresolved(fine)).any(axis=(1, 3))
     return Comparison(*means, differ, crossing)
 
 
@@ -124,3 +128,14 @@ def front_order(scene: wf.Scene) -> np.ndarray:
         np.minimum.at(first[index], pixel[members], fragments.depth[members])
     both = np.isfinite(first).all(axis=0)
     return np.where(both, np.where(first[0] < first[1], 1, -1), 0).reshape(fragments.shape)
+
+
+def unresolved(scene: wf.Scene) -> np.ndarray:
+    """Return whether a depth buffer of 24 bits may not tell the two foremost surfaces apart, by pixel (H, W)."""
+    fragments, camera = wf.capture(scene).numpy(), scene.camera
+    several = np.diff(fragments.offsets) > 1
+    first = fragments.offsets[:-1][several]
+    near = fragments.depth[first].astype(np.float64)
+    close = np.zeros(fragments.pixel_count, bool)
+    close[several] = fragments.depth[first + 1] - near < DEPTH_STEPS * wf.z_resolution(near, camera.near, camera.far)
+    return close.reshape(fragments.shape)
