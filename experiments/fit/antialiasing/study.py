@@ -220,7 +220,7 @@ def best_thickness(case: Case) -> dict[str, np.ndarray]:
     """Search each crossing pixel for its best thickness.
 
     Returns:
-        "t" of those that tell it clearly, with their footprints by name; and "every ratio" of t to the rule's footprint.
+        "t" of those that tell it clearly, with their footprints by name; and in all "every ratio", t over the rule's.
     """
     tried, owner = TRIED[:, None] * case.pixel_size, pixel_of(case.fragments)
     errors = np.stack([case.error(case.image(thickness[owner])).reshape(-1) for thickness in tried])
