@@ -18,7 +18,7 @@ from warpfrag.capture.kbuffer import Culling, capture_kbuffer, count_culled
 from warpfrag.capture.precision import z_resolution
 from warpfrag.capture.render import render
 from warpfrag.composite import composite
-from warpfrag.fit import FitError, FitResult, Study, StudyError, fit, load_study
+from warpfrag.fit import FitError, FitParameter, FitResult, Reference, Study, StudyError, View, fit, load_study
 from warpfrag.fragments import Fragments, Layers
 from warpfrag.resolve.kbuffer import kbuffer
 from warpfrag.resolve.smooth import resolve
@@ -31,14 +31,17 @@ __all__ = [
     "Camera",
     "Culling",
     "FitError",
+    "FitParameter",
     "FitResult",
     "Fragments",
     "Layers",
+    "Reference",
     "Scene",
     "SceneError",
     "SceneObject",
     "Study",
     "StudyError",
+    "View",
     "absorbance",
     "baselines",
     "capture",
