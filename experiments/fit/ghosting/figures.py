@@ -22,15 +22,21 @@ WORST = 0.25
 THINNEST, THICKEST = 0.01, 100.0
 
 
-def draw(target: Target, images: dict[str, np.ndarray], maps: dict[str, np.ndarray], folder: Path) -> None:
-    """Draw the images, and the maps of the last one; a map is NaN where it has nothing to say."""
+def draw(
+    target: Target,
+    images: dict[str, np.ndarray],
+    levels: dict[str, float],
+    maps: dict[str, np.ndarray],
+    folder: Path,
+) -> None:
+    """Draw the images with their PSNR [dB], and the maps of the last one; a map is NaN where it has nothing to say."""
     folder.mkdir(parents=True, exist_ok=True)
     with plt.rc_context(STYLE):
-        pictures(target, images).savefig(folder / "ghosting.png", dpi=150)
+        pictures(target, images, levels).savefig(folder / "ghosting.png", dpi=150)
         charts(maps).savefig(folder / "maps.png", dpi=150)
 
 
-def pictures(target: Target, images: dict[str, np.ndarray]) -> Figure:
+def pictures(target: Target, images: dict[str, np.ndarray], levels: dict[str, float]) -> Figure:
     """Show the scene with the pen's line, the target, the fits and the error of the last."""
     figure = Figure(figsize=(10.0, 5.5), layout="constrained")
     axes = figure.subplots(2, 4)
@@ -39,7 +45,7 @@ def pictures(target: Target, images: dict[str, np.ndarray]) -> Figure:
     shown = [first, ("target", target.image), *others]
     for axis, (name, image) in zip(axes.flat, shown, strict=False):
         axis.imshow(linear_to_srgb(np.clip(image[..., :3], 0.0, 1.0)))
-        axis.set_title(name)
+        axis.set_title(f"{name}, {levels[name]:.1f} dB" if name in levels else name)
     height, width = target.region.shape
     closed = np.concatenate([pen_line(), pen_line()[:1]]) * [width, height] - 0.5
     axes.flat[0].plot(*closed.T, color="#1f78b4", lw=1.2)
@@ -60,7 +66,7 @@ def charts(maps: dict[str, np.ndarray]) -> Figure:
         is_beta = name == "β"
         norm: Any = Normalize(0.0, 1.0) if is_beta else LogNorm(THINNEST, THICKEST)
         drawn = axis.imshow(values, cmap="cividis" if is_beta else "viridis", norm=norm, interpolation="nearest")
-        axis.set(title=name, xticks=[], yticks=[])
+        axis.set(title=name, xticks=[], yticks=[], facecolor="#e6e6e6")
         axis.spines[:].set_visible(False)
         bar = figure.colorbar(drawn, ax=axis, shrink=0.85)
         bar.set_label("" if is_beta else "z-thickness [scene units]")
