@@ -66,7 +66,7 @@ def charts(maps: dict[str, np.ndarray]) -> Figure:
         is_beta = name == "β"
         norm: Any = Normalize(0.0, 1.0) if is_beta else LogNorm(THINNEST, THICKEST)
         drawn = axis.imshow(values, cmap="cividis" if is_beta else "viridis", norm=norm, interpolation="nearest")
-        axis.set(title=name, xticks=[], yticks=[], facecolor="#e6e6e6")
+        axis.set(title=name, xticks=[], yticks=[])
         axis.spines[:].set_visible(False)
         bar = figure.colorbar(drawn, ax=axis, shrink=0.85)
         bar.set_label("" if is_beta else "z-thickness [scene units]")

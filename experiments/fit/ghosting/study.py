@@ -13,7 +13,6 @@ import warp as wp
 
 wp.config.log_level = wp.LOG_WARNING
 
-import torch  # noqa: E402
 from figures import draw  # noqa: E402
 from target import MODULATION, Target, make_target  # noqa: E402
 
@@ -24,8 +23,7 @@ from warpfrag.fit.summary import Figure, Summary, Table  # noqa: E402
 from warpfrag.images import write_image  # noqa: E402
 
 HERE = Path(__file__).parent
-# A change of a pixel that can be seen [linear light].
-VISIBLE = 1.0 / 255.0
+OBJECTS = ("outer", "inner", "gem")
 # What the paper does by hand: large slabs for all, here half of the large bunny's depth [scene units], at beta = 1.
 BY_HAND = {"thickness": 0.6, "beta": 1.0}
 # So thick that more makes no difference [scene units].
@@ -87,21 +85,19 @@ def shown(images: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def maps_of(found: dict[str, dict[str, Any]], scene: wf.Scene) -> dict[str, np.ndarray]:
-    """Return the maps of the last fit, NaN where the image hardly depends on them.
-
-    That is where a factor of e in thickness, or all of the range of beta, changes a pixel by less than `VISIBLE`, to
-    first order.
-    """
+    """Return the maps of the last fit, each only where the image may depend on it."""
+    fragments = wf.capture(scene)
+    pixel = np.repeat(np.arange(fragments.pixel_count), np.diff(fragments.offsets))
+    seen = [
+        np.isin(np.arange(fragments.pixel_count), pixel[fragments.object_id == index]).reshape(fragments.shape)
+        for index in range(len(OBJECTS))
+    ]
     last = list(found.values())[-1]
-    leaves = {name: torch.tensor(value, dtype=torch.float32, requires_grad=True) for name, value in last.items()}
-    # Pixels do not depend on one another: this is each pixel's own derivative.
-    wf.render(scene, parameters=leaves)[..., :3].sum().backward()
-    maps = {}
-    for name, title in (("outer.thickness", "large bunny"), ("inner.thickness", "small bunny"), ("beta", "β")):
-        value, slope = last[name], leaves[name].grad.numpy()
-        change = np.abs(slope if name == "beta" else slope * value) / 3.0
-        maps[title] = np.where(change > VISIBLE, value, np.nan)
-    return maps
+    maps = {
+        f"{title} bunny": np.where(seen[index], last[f"{name}.thickness"], np.nan)
+        for index, (name, title) in enumerate((("outer", "large"), ("inner", "small")))
+    }
+    return {**maps, "β": np.where(seen[0], last["beta"], np.nan)}
 
 
 def decibels(image: np.ndarray, target: Target) -> dict[str, float]:
