@@ -205,6 +205,8 @@ def fit(
         with _logged(wanted.name, log) as progress:
             result = fit_study(wanted, resume=resume, output=folder, progress=progress)
     except KeyboardInterrupt:
+        if not is_first_process():
+            raise typer.Exit(130) from None
         if not (folder / CHECKPOINT).is_file():
             raise typer.Exit(_complain("stopped before the first checkpoint", 130)) from None
         again = f"warpfrag fit {study}" + (f" -o {output}" if output else "") + (f" --size {size}" if size else "")

@@ -176,14 +176,13 @@ class Descent(ABC):
         return total + sum(float(prior.detach()) for prior in priors)
 
     def _over_processes(self, total: float, gradients: list[Any]) -> tuple[float, list[Any]]:
-        """Add up loss and gradients of all processes; a wish to stop in one of them is one in all."""
+        """Add up loss and gradients of all processes."""
         if self.problem.processes.count == 1:
             return total, gradients
         torch = self.torch
         flat = torch.cat([gradient.reshape(-1) for gradient in gradients]).cpu().numpy()
-        summed = self.problem.processes.sum(np.concatenate([[total, float(self.session.interrupted)], flat]))
-        self.session.interrupted = bool(summed[1])
-        parts = torch.as_tensor(summed[2:], device=gradients[0].device).split([g.numel() for g in gradients])
+        summed = self.problem.processes.sum(np.concatenate([[total], flat]))
+        parts = torch.as_tensor(summed[1:], device=gradients[0].device).split([g.numel() for g in gradients])
         return float(summed[0]), [part.reshape(g.shape) for part, g in zip(parts, gradients, strict=True)]
 
     def full_loss(self) -> float:

@@ -90,10 +90,17 @@ def _sum_kernel() -> wp.Kernel:
 
 
 class ViewEvaluation:
-    """The image of a view for parameter values, and its Jacobian when asked for."""
+    """The image of a view for parameter values, and its Jacobian when asked for.
 
-    def __init__(self, problem: ViewProblem, loss: RobustLoss, values: Mapping[str, Any]) -> None:
-        self.problem, self.loss = problem, loss
+    Args:
+        problem: the view.
+        loss: the loss of each level.
+        values: the parameters.
+        scales: levels of the image pyramid.
+    """
+
+    def __init__(self, problem: ViewProblem, loss: RobustLoss, values: Mapping[str, Any], scales: int) -> None:
+        self.problem, self.loss, self.scales = problem, loss, scales
         self.variables = problem.study.variables
         self.values = problem.parameters(values)
         self.coverage, self.unit = self._unit()
@@ -117,7 +124,7 @@ class ViewEvaluation:
             shared = Fragments(self.rgba, self.depth, self.thickness, offsets, self.fragments.shape)
             self.raw = problem.composite(shared, self.beta)
         self.residual = problem.residual(problem.over_background(self.raw.numpy())).astype(np.float64)
-        levels = [loss.rho(level).mean() for level in pyramid(self.residual, problem.study.scales)]
+        levels = [loss.rho(level).mean() for level in pyramid(self.residual, scales)]
         self.cost = float(np.mean(levels))
 
     @property
@@ -132,8 +139,8 @@ class ViewEvaluation:
             jacobian = self.channel(channel).reshape(*covered.shape, -1)
             rows = np.concatenate([self.residual[..., channel, None], jacobian], axis=-1)
             levels = [np.concatenate([rows, covered[..., None]], axis=-1)]
-            if self.problem.study.scales > 1:
-                levels = list(pyramid(levels[0], self.problem.study.scales))
+            if self.scales > 1:
+                levels = list(pyramid(levels[0], self.scales))
             for level in levels:
                 # Pixels that no fragment covers do not depend on anything.
                 inside = level[level[..., -1] > 0.0][:, :-1]
@@ -241,21 +248,32 @@ class ViewEvaluation:
 
 
 class Evaluation:
-    """The images of all views for one vector of coordinates, and their Jacobian when asked for."""
+    """The images of all views for one vector of coordinates, and their Jacobian when asked for.
 
-    def __init__(self, problem: Problem, loss: RobustLoss, coordinates: np.ndarray) -> None:
+    Args:
+        problem: the views.
+        loss: the loss of each level.
+        coordinates: the vector.
+        scales: levels of the image pyramid; None takes the study's.
+    """
+
+    def __init__(self, problem: Problem, loss: RobustLoss, coordinates: np.ndarray, scales: int | None = None) -> None:
         self.problem, self.size = problem, coordinates.size
         values = problem.values(coordinates)
         mine = problem.processes.share(list(range(len(problem.views))))
-        self.views = [ViewEvaluation(problem.views[index], loss, values) for index in mine]
+        scales = problem.study.scales if scales is None else scales
+        self.views = [ViewEvaluation(problem.views[index], loss, values, scales) for index in mine]
         total = problem.processes.sum(np.array([sum(view.cost for view in self.views)]))
         self.cost = float(total[0]) / len(problem.views)
 
-    @property
-    def covered_count(self) -> int:
-        """Number of residuals in pixels that any object covers."""
-        mine = sum(np.count_nonzero(view.covered) * view.problem.channels for view in self.views)
-        return int(self.problem.processes.sum(np.array([float(mine)]))[0])
+    def covered(self) -> tuple[int, float]:
+        """Return the number of residuals in pixels that any object covers, and the sum of their squares."""
+        mine = np.zeros(2)
+        for view in self.views:
+            residual = view.residual[view.covered]
+            mine += residual.size, np.square(residual).sum()
+        count, squares = self.problem.processes.sum(mine)
+        return int(count), float(squares)
 
     def compress(self) -> Compressed:
         """Return the compressed residuals and Jacobian."""
@@ -289,9 +307,8 @@ def _compress(triangle: np.ndarray, cost: float) -> Compressed:
     Jᵀf.
     """
     inside, cross = triangle[0, 0], triangle[0, 1:]
-    if inside < 0.0:
-        inside, cross = -inside, -cross
-    total = max(np.sqrt(cost), inside)
+    # The sign of a triangle's row is arbitrary: that of the cosine goes with it.
+    total = max(np.sqrt(cost), abs(inside))
     cosine = inside / total if total > 0.0 else 1.0
     sine = np.sqrt(max(0.0, 1.0 - cosine**2))
     return Compressed(cost, np.concatenate([cosine * cross[None], triangle[1:, 1:], sine * cross[None]]))

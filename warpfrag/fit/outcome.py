@@ -53,23 +53,31 @@ class Certainty:
     undetermined: tuple[str, ...]
 
 
-def assess(compressed: Compressed, variables: Sequence[Variable], residual_count: int, covered_count: int) -> Certainty:
+def assess(
+    compressed: Compressed,
+    variables: Sequence[Variable],
+    residual_count: int,
+    covered_count: int,
+    covered_squares: float,
+) -> Certainty:
     """Return how well an image determines parameters.
 
-    Standard errors are the square roots of the diagonal of s²·(JᵀJ)⁻¹, with s² the residuals' variance (that of float32
-    rounding at least). A parameter counts as undetermined when its standard error exceeds `UNDETERMINED`, which it does
-    without limit when the image is flat along a direction in which the parameter takes part.
+    Standard errors are the square roots of the diagonal of s²·(JᵀJ)⁻¹, with s² the residuals' variance where any object
+    covers the image (that of float32 rounding at least): what no parameter can change says nothing of them. A parameter
+    counts as undetermined when its standard error exceeds `UNDETERMINED`, which it does without limit when the image is
+    flat along a direction in which the parameter takes part.
 
     Args:
-        compressed: residuals and Jacobian at the end.
+        compressed: residuals and Jacobian at the end, of the mean square.
         variables: the parameters.
         residual_count: number of all residuals.
         covered_count: number of residuals in pixels that any object covers.
+        covered_squares: sum of their squares.
     """
     jacobian = compressed.jacobian * np.sqrt(residual_count)
     count = jacobian.shape[1]
     freedom = max(1, covered_count - count)
-    variance = max(compressed.cost * residual_count / freedom, SMALLEST_NOISE**2)
+    variance = max(covered_squares / freedom, SMALLEST_NOISE**2)
     _, singular, rows = np.linalg.svd(jacobian, full_matrices=False)
     condition = float(singular[0] / singular[-1]) if singular[-1] > 0.0 else np.inf
     # Columns scaled alike first, so that a weak but independent parameter is not taken for a flat direction.

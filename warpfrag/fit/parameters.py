@@ -11,6 +11,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
+from warpfrag.capture.precision import z_resolution
 from warpfrag.scene.camera import Camera
 from warpfrag.scene.errors import shorten, suggest
 from warpfrag.scene.objects import Scene, SceneObject, multiple_of_p
@@ -268,8 +269,16 @@ def _resolve(scene: Scene, cameras: Sequence[Camera], size: float, name: str, pa
     _check_map_options(parameter, per, cameras, where)
     unit = {"vertices": VERTEX_UNIT * size, "translation": VERTEX_UNIT * size, "rotation": math.degrees(1.0)}
     return Variable(
-        *(name, start, lower, upper, per, key == "thickness", unit.get(key, 1.0), rate),
-        *(float(parameter.smoothness), parameter.levels),
+        name=name,
+        start=start,
+        lower=lower,
+        upper=upper,
+        per=per,
+        logarithm=key == "thickness",
+        unit=unit.get(key, 1.0),
+        learning_rate=rate,
+        smoothness=float(parameter.smoothness),
+        levels=parameter.levels,
     )
 
 
@@ -341,12 +350,12 @@ def _shapes(scene: Scene, cameras: Sequence[Camera], name: str, key: str) -> dic
 def _thickness_bounds(scene: Scene, items: Sequence[SceneObject], size: float) -> tuple[float, float]:
     lower, upper = SMALLEST_THICKNESS * size, LARGEST_THICKNESS * size
     if items and items[0].thickness_unit == "P":
-        # In multiples of P(z) at the objects' middle (FORMULAS 11, 24 bits).
-        camera, step = scene.camera, 2.0**-24
+        # In multiples of P(z) at the objects' middle.
+        camera = scene.camera
         vertices = [item.world_vertices() for item in items if len(item.vertices)]
         middle = np.concatenate(vertices).mean(axis=0) if vertices else np.asarray(camera.target)
         z = max(float((camera.view_matrix()[:3, :3] @ (middle - np.asarray(camera.eye)))[2]), camera.near)
-        resolution = z * z * step / (camera.near * camera.far / (camera.far - camera.near) + z * step)
+        resolution = float(z_resolution(z, camera.near, camera.far))
         return lower / resolution, upper / resolution
     return lower, upper
 

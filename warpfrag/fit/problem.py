@@ -181,7 +181,8 @@ def reference_image(study: Study, view: View, index: int = 0) -> np.ndarray:
         image = np.asarray(reference.image, np.float32)
         return over_background(image, scene.background) if image.shape[2] == 4 else image
     samples = reference.supersampling
-    options = {key: getattr(reference, key) or getattr(scene, key) for key in RENDER_OPTIONS}
+    own = {key: getattr(reference, key) for key in RENDER_OPTIONS}
+    options = {key: value for key, value in own.items() if value is not None}
     fine = replace(scene, camera=view.camera.resized((width * samples, height * samples)), **options)
     fine, true = in_multiples_of_p(fine, true_of_view(reference, index, len(study.fitted_views)), "reference.true")
     image = np.asarray(render_scene(fine, study.resolve, true))

@@ -87,9 +87,11 @@ def _run(study: Study, resume: bool, output: Path | None, report: Callable[[Prog
     started = time.monotonic()
     problem = Problem(study)
     digest = fingerprint(study, [view.reference for view in problem.views])
-    session = Session(study, digest, output, report, started, is_first_process())
+    folder = output if is_first_process() else None
+    session = Session(study, digest, folder, report, started, problem.processes)
     if resume:
-        session.load()
+        assert output is not None
+        session.load(output)
     before = _images(problem, problem.values(problem.start()))
     methods: dict[str, Any] = {"least_squares": LeastSquares, "adam": Adam, "lbfgs": LBFGS}
     runs, outcomes = [], []
@@ -157,9 +159,10 @@ def _certainty(
     study = problem.study
     if not study.is_global:
         return None, None, ()
-    evaluation = Evaluation(problem, study.image_loss.robust or RobustLoss.named("l2", study.delta), coordinates)
+    # Whatever the loss: how far images may differ by noise is a matter of squares, at the scale that has the noise.
+    evaluation = Evaluation(problem, RobustLoss.named("l2", study.delta), coordinates, scales=1)
     residual_count = sum(view.reference.size for view in problem.views)
-    certainty = assess(evaluation.compress(), study.variables, residual_count, evaluation.covered_count)
+    certainty = assess(evaluation.compress(), study.variables, residual_count, *evaluation.covered())
     errors = {}
     for variable, place in placed(study.variables):
         error = certainty.standard_errors[place].reshape(variable.start.shape)

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from warpfrag.fit.parameters import values_words
+from warpfrag.fit.processes import Processes
 from warpfrag.fit.study import Study
 from warpfrag.saving import replacing
 
@@ -58,10 +59,10 @@ class Session:
     Args:
         study: the study.
         fingerprint: of the study, see `fingerprint`.
-        folder: where the checkpoint goes; None writes none.
-        writes: whether this process is the one that writes and reports.
-        report: called after each step.
+        folder: where this process writes the checkpoint; None writes none.
+        report: called after each step, None for nothing.
         started: when the fit began, by the monotonic clock.
+        processes: those that fit together; None for this one alone.
     """
 
     def __init__(
@@ -71,10 +72,10 @@ class Session:
         folder: Path | None,
         report: Callable[[Progress], None] | None,
         started: float,
-        writes: bool = True,
+        processes: Processes | None = None,
     ) -> None:
         self.study, self.fingerprint, self.folder = study, fingerprint, folder
-        self.writes, self.report = writes, report if writes else None
+        self.report, self.processes = report, processes
         self.losses: list[float] = []
         self.state: dict[str, Any] = {}
         self.seconds_before = 0.0
@@ -87,14 +88,13 @@ class Session:
         """Time spent on the fit, that before a resume included."""
         return self.seconds_before + time.monotonic() - self.started
 
-    def load(self) -> None:
-        """Take up the checkpoint.
+    def load(self, folder: Path) -> None:
+        """Take up the checkpoint in a folder.
 
         Raises:
             FitError: it cannot be read, or it belongs to another study.
         """
-        assert self.folder is not None
-        path = self.folder / CHECKPOINT
+        path = folder / CHECKPOINT
         expected = "the one of this study (scene, reference, parameters, method); start without resume"
         try:
             saved = _read(path, self.study)
@@ -108,7 +108,7 @@ class Session:
 
     def save(self) -> None:
         """Write the checkpoint."""
-        if self.folder is None or not self.writes:
+        if self.folder is None:
             return
         content = {**self.state, "version": _VERSION, "fingerprint": self.fingerprint, "seconds": self.seconds}
         with replacing(self.folder / CHECKPOINT) as partial, partial.open("wb") as file:
@@ -132,6 +132,9 @@ class Session:
             KeyboardInterrupt: the user asked to stop; the checkpoint is written.
         """
         self.losses.append(loss)
+        if self.processes is not None:
+            # A wish to stop in one of them is one in all.
+            self.interrupted = bool(self.processes.sum(np.array([float(self.interrupted)]))[0])
         due = time.monotonic() - self.written >= self.study.checkpoint_seconds
         if self.folder is not None and (due or self.interrupted):
             self.state = state()
@@ -219,7 +222,7 @@ def fingerprint(study: Study, references: Sequence[np.ndarray]) -> str:
         add(variable.per, variable.smoothness, variable.levels)
     add(study.image_loss, study.method, study.seed, study.restarts, study.learning_rate, study.tolerance, study.device)
     add(study.patience, study.batch)
-    if any(variable.levels > 1 for variable in study.variables):
-        # How many steps there are then decides when the stages change.
+    if study.batch is not None or any(variable.levels > 1 for variable in study.variables):
+        # How many steps there are then decides when the stages change, and when all views are looked at.
         add(study.steps)
     return digest.hexdigest()

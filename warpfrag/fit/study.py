@@ -20,7 +20,7 @@ from warpfrag.fit.parameters import (
 from warpfrag.scene.camera import Camera
 from warpfrag.scene.errors import shorten
 from warpfrag.scene.geometry import assemble
-from warpfrag.scene.objects import Scene
+from warpfrag.scene.objects import MERGES, MIXES, Scene
 from warpfrag.scene.table import is_number
 
 Method = Literal["least_squares", "adam", "lbfgs"]
@@ -33,6 +33,8 @@ DEFAULT_STEPS = {"least_squares": 100, "adam": 300, "lbfgs": 100}
 DEFAULT_PATIENCE = {"least_squares": 1, "adam": 50, "lbfgs": 3}
 
 RENDER_OPTIONS = ("merge", "mix", "layers")
+# What of them a k-buffer takes.
+KBUFFER_MERGES, KBUFFER_MIXES = ("order_independent", "none"), ("opacity",)
 
 
 class StudyError(ValueError):
@@ -158,7 +160,7 @@ class Study:
             numeric = {name: replace(parameter, start=starts[name]) for name, parameter in given.items()}
             object.__setattr__(self, "variables", resolve_parameters(scene, cameras, numeric))
             for view in self.all_views:
-                _check_reference(view, self.scene, len(cameras))
+                _check_reference(view, self.scene, len(cameras), self.resolve)
         except StudyError:
             raise
         except (ValueError, TypeError) as error:
@@ -253,6 +255,13 @@ class Study:
     def _check_held_out(self) -> None:
         if len(self.fitted_views) == len(self.all_views):
             return
+        count, reference = len(self.fitted_views), self.reference
+        for name, value in (reference.true or {} if reference is not None else {}).items():
+            if is_stacked(name, value, count):
+                raise StudyError(
+                    f"reference.true.{name}: found one value per view with views that are held out, for which there is "
+                    "none; expected one that all views share"
+                )
         for variable in self.variables:
             if variable.per in ("pixel", "view"):
                 raise StudyError(
@@ -280,7 +289,7 @@ class Study:
 
     def _check_kbuffer(self) -> None:
         scene = self.scene
-        for key, choices in (("merge", ("order_independent", "none")), ("mix", ("opacity",))):
+        for key, choices in (("merge", KBUFFER_MERGES), ("mix", KBUFFER_MIXES)):
             if getattr(scene, key) not in choices:
                 expected = " or ".join(f'"{choice}"' for choice in choices)
                 raise StudyError(f'{key}: found "{getattr(scene, key)}" with resolve "kbuffer", expected {expected}')
@@ -288,7 +297,25 @@ class Study:
             raise StudyError('parameters: found beta with resolve "kbuffer", in which it plays no part')
 
 
-def _check_reference(view: View, scene: Scene, count: int) -> None:
+def _check_render_options(reference: Reference, resolve: str) -> None:
+    """Raise for options of a reference's render that are none, or that a k-buffer does not have."""
+    kbuffer = resolve == "kbuffer"
+    for key, choices in (
+        ("merge", KBUFFER_MERGES if kbuffer else MERGES),
+        ("mix", KBUFFER_MIXES if kbuffer else MIXES),
+    ):
+        value = getattr(reference, key)
+        if value is not None and value not in choices:
+            expected = " or ".join(f'"{choice}"' for choice in choices)
+            raise StudyError(
+                f"reference.{key}: found {shorten(value)}, expected {expected}" + ' with resolve "kbuffer"' * kbuffer
+            )
+    layers = reference.layers
+    if layers is not None and (isinstance(layers, bool) or not isinstance(layers, int) or layers < 1):
+        raise StudyError(f"reference.layers: found {shorten(layers)}, expected a whole number from 1")
+
+
+def _check_reference(view: View, scene: Scene, count: int, resolve: str) -> None:
     reference = view.reference
     if reference is None:
         raise StudyError(f'reference: found none for the view "{view.name}", expected an image or true')
@@ -296,6 +323,7 @@ def _check_reference(view: View, scene: Scene, count: int) -> None:
         found = "neither" if reference.image is None else "both"
         raise StudyError(f"reference: found {found} of image and true, expected one of them")
     if reference.true is not None:
+        _check_render_options(reference, resolve)
         for name in reference.true:
             check_name(name, scene, "reference.true")
         scene, true = in_multiples_of_p(scene, true_of_view(reference, 0, count), "reference.true")
@@ -336,11 +364,15 @@ def _check_beta(value: Any, camera: Camera, count: int) -> None:
 
 def true_of_view(reference: Reference, index: int, count: int) -> dict[str, Any]:
     """Return a reference's values for one of `count` fitted views: its part of what is stacked by view."""
-    result = {}
-    for name, value in (reference.true or {}).items():
-        array = np.asarray(value)
-        is_map = name.endswith(("thickness", "beta")) and array.ndim == 3
-        is_pose = name.startswith("camera.") and array.ndim == 2
-        stacked = (is_map or is_pose) and len(array) == count
-        result[name] = array[index] if stacked else value
-    return result
+    return {
+        name: np.asarray(value)[index] if is_stacked(name, value, count) else value
+        for name, value in (reference.true or {}).items()
+    }
+
+
+def is_stacked(name: str, value: Any, count: int) -> bool:
+    """Whether a reference's value has a part for each of `count` views."""
+    array = np.asarray(value)
+    is_map = name.endswith(("thickness", "beta")) and array.ndim == 3
+    is_pose = name.startswith("camera.") and array.ndim == 2
+    return (is_map or is_pose) and len(array) == count

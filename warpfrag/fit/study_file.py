@@ -21,7 +21,6 @@ red.thickness = {start = 0.4, lower = 0.01, upper = 2}  # and between which boun
 green.thickness = {start = "2P", per = "pixel", smoothness = 0.01, levels = 3}
 """
 
-import math
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -176,9 +175,14 @@ def _parameters(top: Table, scene: Scene) -> dict[str, FitParameter]:
         start = None if "start" not in entry else _value(entry, "start", name, given["start"])
         lower, upper = entry.number("lower"), entry.number("upper")
         per: Any = entry.choice("per", PER)
-        smoothness, levels = entry.number("smoothness", 0.0), entry.integer("levels", 1, 64)
         result[name] = FitParameter(
-            *(start, lower, upper, per, entry.number("learning_rate", above=0.0)), smoothness or 0.0, levels or 1
+            start=start,
+            lower=lower,
+            upper=upper,
+            per=per,
+            learning_rate=entry.number("learning_rate", above=0.0),
+            smoothness=entry.number("smoothness", 0.0) or 0.0,
+            levels=entry.integer("levels", 1, 64) or 1,
         )
     return result
 
@@ -203,4 +207,4 @@ def _value(table: Table, key: str, name: str, value: Any) -> Any:
 def _is_numeric(value: list) -> bool:
     if all(isinstance(part, list) for part in value):
         return bool(value) and len({len(part) for part in value}) == 1 and all(is_numbers(p, len(p)) for p in value)
-    return is_numbers(value, len(value)) and math.prod((len(value),)) > 0
+    return is_numbers(value, len(value))

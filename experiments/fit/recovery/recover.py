@@ -173,8 +173,7 @@ class Setting:
         """Return the standard errors of all parameters, relative to their values, for noise of 1 in the image."""
         problem = self.problem(self.study(values, self.images(values)))
         evaluation = Evaluation(problem, RobustLoss.named("l2", 1.0), problem.start())
-        covered = evaluation.covered_count
-        certainty = assess(evaluation.compress(), problem.study.variables, self.residual_count, covered)
+        certainty = assess(evaluation.compress(), problem.study.variables, self.residual_count, *evaluation.covered())
         # The image is its own reference: all noise is what `assess` assumes. Those of thicknesses are relative already.
         return {
             name: float(error) / SMALLEST_NOISE / (values[name] if name == "beta" else 1.0)
@@ -259,7 +258,11 @@ def _least_squares(problem: Problem, meter: Meter) -> None:
         meter.record(images + len(fit.costs), passes + COLORS * len(fit.jacobians), cost, np.frombuffer(key))
 
     fit = LeastSquares(problem, Session(problem.study, "", None, look, 0.0))
-    fit.run(problem.start())
+    try:
+        fit.run(problem.start())
+    finally:
+        # A Jacobian may follow the last image.
+        meter.images, meter.passes = images + len(fit.costs), passes + COLORS * len(fit.jacobians)
 
 
 def _descend(problem: Problem, meter: Meter) -> None:

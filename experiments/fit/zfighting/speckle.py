@@ -17,8 +17,6 @@ VISIBLE = 1.0 / 255.0
 FEW = 1e-3
 # Multiples of P(z) between which the smallest is sought, and how closely [relative].
 SMALLEST, LARGEST, CLOSE = 2.0**-10, 2.0**18, 5e-3
-# Thickness [P(z)] that stands for none where planes are to be mixed even so.
-THIN = 1e-3
 # Ways to merge: the name, "merge", beta.
 WAYS = {"OFM": ("order_independent", 1.0), "SFM": ("smooth", 1.0), "SFM, β = 0": ("smooth", 0.0)}
 
