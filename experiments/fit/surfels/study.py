@@ -38,7 +38,7 @@ SHARES = (0.25, 1.0, 4.0)
 RIMS = (0.8, 1.0, 1.1, 1.2, 1.4, 1.6, 2.0)
 # Of the views to fit those that judge learning rates and numbers of steps; study.toml has the best.
 JUDGES = ("side_4", "side_8")
-RATES, STEPS = (0.00375, 0.0075, 0.015), (75, 150, 300)
+RATES, STEPS = (0.00375, 0.0075, 0.015), (40, 75, 150, 300)
 MERGES: dict[Merge, str] = {"none": "plain over", "smooth": "SFM", "order_independent": "OFM", "exact": "exact"}
 ALL = ("color", "opacity", "thickness")
 CAPTION = "Mean PSNR [dB] of whole images in linear light, {} views that are fitted and {} that are held out:"
@@ -48,7 +48,7 @@ def main() -> None:
     """Measure, fit, draw, and write the README's numbers."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("--size", type=int, help="width and height of the images (128)")
-    parser.add_argument("--steps", type=int, help="of each fit (150)")
+    parser.add_argument("--steps", type=int, help="of each fit (75)")
     parser.add_argument("--points", type=int, default=POINTS, help=f"how many points ({POINTS})")
     arguments = parser.parse_args()
     mesh = load_bunny()
@@ -106,7 +106,7 @@ class Tuned:
 def tune(setting: Setting) -> dict[tuple[float, int], Tuned]:
     """Fit colours and opacities without the judges, at every learning rate, and judge along the way."""
     views = [replace(view, held_out=view.name in JUDGES) for view in setting.views(held_out=False)]
-    most = min(STEPS[-1], int(setting.study.steps or 0) * 2)
+    most = max((steps for steps in STEPS if steps <= 4 * int(setting.study.steps or 0)), default=STEPS[0])
     found = {}
     for rate in RATES:
         study = replace(setting.study, views=views, learning_rate=rate, steps=most + 1, patience=most + 1)
