@@ -11,9 +11,10 @@ from small_scene import spheres
 from warpfrag.capture.render import render
 from warpfrag.fit import FitError, FitParameter, FitResult, Reference, Study, StudyError, fit
 from warpfrag.fit import problem as problem_module
-from warpfrag.fit.jacobian import Evaluation
+from warpfrag.fit.jacobian import Evaluation, _triangle
 from warpfrag.fit.losses import RobustLoss
 from warpfrag.fit.problem import Problem, ViewProblem
+from warpfrag.fit.session import fingerprint
 from warpfrag.images import read_image, write_image
 from warpfrag.scene.objects import SceneObject
 from warpfrag.scene.primitives import plane
@@ -133,6 +134,25 @@ def test_standard_errors_are_those_of_repeated_fits():
     # Twelve draws give the scatter to about 20 %; three times that is allowed.
     ratio = np.std(found, axis=0, ddof=1) / np.mean(predicted, axis=0)
     assert ((ratio > 0.4) & (ratio < 1.6)).all(), ratio
+
+
+@pytest.mark.parametrize("options", [{"loss": "l2"}, {"loss": "l1"}, {"loss": "huber", "delta": 1e-3}, {"scales": 3}])
+def test_certainty_is_that_of_what_objects_cover(options):
+    """Whatever the loss and its scales, and whatever the reference has where no object is."""
+    study = make_study({"beta": 0.5, "red.thickness": 0.3}, steps=1)
+    clean = Problem(study).views[0].reference
+    fragments = Problem(study).views[0].fragments
+    covered = (np.diff(fragments.offsets) > 0).reshape(fragments.shape)
+    generator = np.random.default_rng(6)
+    noise = generator.normal(0.0, 0.005, clean.shape).astype(np.float32)
+    beside = np.where(covered[..., None], noise, 0.4)
+    # Opacity, which does not depend on them, is not compared.
+    plain, other = (Reference(image=np.ascontiguousarray((clean + n)[..., :3])) for n in (noise, beside))
+    expected = fit(replace(study, reference=plain)).standard_errors
+    found = fit(replace(study, reference=other, **options)).standard_errors
+    for name, value in expected.items():
+        # One step of another loss ends elsewhere.
+        assert found[name] == pytest.approx(value, rel=0.3)
 
 
 def test_undetermined_parameters_are_named():
@@ -266,6 +286,83 @@ def test_resume_is_refused(tmp_path):
     (tmp_path / "checkpoint.dat").write_bytes(b"nonsense")
     with pytest.raises(FitError, match="cannot be read"):
         fit(study, resume=True, output=tmp_path)
+
+
+def _named(scene):
+    scene.objects[2].name = "violet"
+    return {}
+
+
+def _moved(scene):
+    scene.objects[0].matrix[0, 3] += 1e-3
+    return {}
+
+
+def _deformed(scene):
+    scene.objects[0].vertices = scene.objects[0].vertices * np.float32(1.001)
+    return {}
+
+
+def _coloured(scene):
+    scene.objects[0].color = (0.9, 0.1, 0.11)
+    return {}
+
+
+CHANGES = {
+    "name": _named,
+    "matrix": _moved,
+    "vertices": _deformed,
+    "color": _coloured,
+    "start": lambda scene: {"parameters": {"beta": 0.9, "red.thickness": 0.81}},
+    "bounds": lambda scene: {"parameters": {"beta": 0.9, "red.thickness": FitParameter(0.8, 0.1, 2.0)}},
+    "method": lambda scene: {"method": "lbfgs"},
+    "loss": lambda scene: {"loss": "l1"},
+    "seed": lambda scene: {"seed": 1},
+    "reference": lambda scene: {"reference": Reference(true={"beta": 0.6})},
+    "learning rate": lambda scene: {"learning_rate": 0.03},
+    "patience": lambda scene: {"patience": 20},
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_fingerprint_tells_studies_apart(change):
+    """Any change that makes another fit of it makes another fingerprint; more steps do not."""
+    starts = {"beta": 0.9, "red.thickness": 0.8}
+    study = make_study(starts, method="adam", steps=2)
+    scene = spheres()
+    changes = CHANGES[change](scene)
+    other = replace(study, **({"scene": scene} | changes))
+    prints = [fingerprint(s, [view.reference for view in Problem(s).views]) for s in (study, other)]
+    assert prints[0] != prints[1]
+    longer = replace(study, steps=5)
+    assert fingerprint(longer, [view.reference for view in Problem(longer).views]) == prints[0]
+
+
+def test_resumed_history_decides_the_end(tmp_path):
+    """Resumed shortly before its patience ends, Adam stops where an unbroken fit does, with the same count."""
+    options = {"method": "adam", "patience": 5, "steps": 200, "learning_rate": 0.2, "checkpoint_seconds": 0.0}
+    study = make_study({"red.color": [0.9, 0.1, 0.1]}, **options)
+    whole = fit(study)
+    assert whole.converged
+
+    def stop(progress):
+        if progress.step == len(whole.losses) - 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fit(study, output=tmp_path, progress=stop)
+    resumed = fit(study, output=tmp_path, resume=True)
+    assert (resumed.converged, resumed.losses, resumed.evaluations) == (True, whole.losses, whole.evaluations)
+
+
+def test_triangle_takes_all_rows():
+    """However many whole blocks there are, and rows after them, RᵀR is that of all rows."""
+    generator = np.random.default_rng(7)
+    for count in (3, 500, 1300):
+        rows = generator.normal(size=(count, 5))
+        triangle = _triangle([rows[: count // 2], rows[count // 2 :]])
+        assert triangle.shape == (5, 5)
+        np.testing.assert_allclose(triangle.T @ triangle, rows.T @ rows, rtol=1e-10, atol=1e-10)
 
 
 @pytest.mark.parametrize("method", ["least_squares", "adam", "lbfgs"])

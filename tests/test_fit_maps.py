@@ -9,7 +9,10 @@ from small_scene import spheres
 
 import warpfrag as wf
 from warpfrag.fit import FitError, FitParameter, FitResult, Reference, Study, StudyError, fit
+from warpfrag.fit.descent import Adam
 from warpfrag.fit.maps import Smoothness, coarsen, level_of, refine
+from warpfrag.fit.problem import Problem
+from warpfrag.fit.session import Session
 
 
 def make_study(parameters, *, true=None, scene=None, **options) -> Study:
@@ -27,6 +30,11 @@ def test_grids_go_there_and_back():
     """A constant stays what it is, a refined grid stays within the coarse one's values, sizes are rounded up."""
     grid = torch.arange(35.0, dtype=torch.float64).reshape(5, 7)
     assert coarsen(grid, 0) is grid
+    # Means of what each coarse pixel covers; in between linear, and constant beyond the outer middles.
+    torch.testing.assert_close(coarsen(grid[:4, :4], 1), torch.tensor([[4.0, 6.0], [18.0, 20.0]]).double())
+    torch.testing.assert_close(
+        refine(torch.tensor([[0.0, 4.0]]).double(), (1, 4))[0], torch.tensor([0, 1, 3, 4]).double()
+    )
     assert coarsen(grid, 1).shape == (3, 4)
     assert coarsen(grid, 9).shape == (1, 1)
     assert refine(coarsen(grid, 1), (5, 7)).shape == (5, 7)
@@ -60,6 +68,35 @@ def test_smoothness_of_vertices():
     ends = int((prior.edges == 0).sum())
     assert prior(moved).item() == pytest.approx(2.0 * ends / (3 * len(prior.edges)))
     assert len({tuple(edge) for edge in prior.edges.tolist()}) == len(prior.edges)
+
+
+def test_gradient_of_a_loss_with_a_prior():
+    """What Adam steps by is the slope of the loss, prior included, in the coordinates of a coarse map."""
+    scene = spheres()
+    generator = np.random.default_rng(3)
+    start = generator.uniform(0.1, 0.3, (36, 40))
+    parameters = {"thickness": FitParameter(start, 0.05, 0.8, smoothness=0.3, levels=2), "beta": 0.6}
+    study = make_study(parameters, scene=scene, method="adam", steps=4)
+    problem = Problem(study)
+    adam = Adam(problem, Session(study, "", None, None, 0.0))
+    adam.begin = 0
+    adam.best_loss, adam.best, adam.evaluations = np.inf, problem.start(), 0
+    adam._enter(0, problem.start(), 2)
+    loss = adam.evaluate([0])
+    leaf = adam.coordinates[0].leaf
+    slopes = leaf.grad.clone()
+    assert loss == pytest.approx(adam.full_loss(), rel=1e-12)
+    # A step in which float32's rounding of the image, 1e-7, is small beside the prior's and the image's change.
+    step, direction = 1e-3, torch.tensor(generator.normal(size=leaf.shape))
+    ends = []
+    for sign in (1.0, -1.0):
+        leaf.data += sign * step * direction
+        ends.append(adam.full_loss())
+        leaf.data -= sign * step * direction
+    assert float((slopes * direction).sum()) == pytest.approx((ends[0] - ends[1]) / (2.0 * step), rel=1e-2)
+    # The prior is most of it.
+    _, priors = adam._values_and_priors()
+    assert float(priors[0].detach()) > 0.5 * loss
 
 
 @pytest.mark.parametrize("method", ["adam", "lbfgs"])
@@ -163,6 +200,26 @@ def test_all_restarts_are_reported(method):
     assert first.found == next(run.found for run in first.runs if run.loss == first.loss)
     assert first.to_json()["runs"][2]["loss"] == first.runs[2].loss
     assert any("3 starts" in line for line in first.lines())
+
+
+def test_random_starts_are_spread():
+    """They differ from one another, a colour's numbers too, and lie between the bounds."""
+    starts = Problem(make_study({"red.color": [0.5] * 3, "red.thickness": 0.3}, restarts=3)).starts()[1:]
+    lower, upper = Problem(make_study({"red.color": [0.5] * 3, "red.thickness": 0.3})).bounds()
+    for start in starts:
+        assert ((start > lower) & (start < upper)).all()
+        assert np.ptp(start[:3]) > 0.01
+    assert np.ptp(np.array(starts), axis=0).min() > 0.01
+
+
+def test_each_parameter_may_have_its_learning_rate():
+    """Adam's first step has the length of the parameter's own rate."""
+    parameters = {"red.color": FitParameter([0.5] * 3, learning_rate=0.1), "green.color": [0.5] * 3}
+    study = make_study(parameters, method="adam", steps=2, learning_rate=0.01)
+    seen = []
+    fit(study, progress=lambda progress: seen.append(progress.parameters))
+    for name, rate in (("red.color", 0.1), ("green.color", 0.01)):
+        np.testing.assert_allclose(np.abs(seen[1][name] - seen[0][name]).max(), rate, rtol=1e-3)
 
 
 def test_patience_stops_early():

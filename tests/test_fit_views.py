@@ -12,10 +12,13 @@ import torch
 from small_scene import spheres
 
 from warpfrag.capture.render import render
-from warpfrag.fit import FitParameter, Reference, Study, StudyError, View, fit, load_study
+from warpfrag.fit import FitError, FitParameter, Reference, Study, StudyError, View, fit, load_study
+from warpfrag.fit.descent import Adam
 from warpfrag.fit.jacobian import Evaluation
 from warpfrag.fit.losses import RobustLoss
 from warpfrag.fit.problem import Problem
+from warpfrag.fit.processes import Processes
+from warpfrag.fit.session import Session
 from warpfrag.scene.camera import Camera
 from warpfrag.scene.objects import Scene
 
@@ -105,11 +108,23 @@ MOTIONS = {
 }
 
 
+@pytest.mark.parametrize("per_vertex", [False, True])
 @pytest.mark.parametrize("name", MOTIONS)
-def test_motion_columns_are_autograd(name):
-    """The columns of transforms and cameras are what torch says for each pixel, with coverage held fixed."""
+def test_motion_columns_are_autograd(name, per_vertex):
+    """The columns of transforms and cameras are what torch says for each pixel, with coverage held fixed.
+
+    Per vertex, what moves with its surface is colour, opacity and a thickness in P(z) that is fitted.
+    """
     scene = replace(spheres(), background=(0.4, 0.3, 0.2, 0.5))
-    parameters = {**MOTIONS, "beta": 0.5, "red.opacity": 0.7, "green.color": [0.3, 0.4, 0.5], "red.thickness": 0.4}
+    parameters = {**MOTIONS, "beta": 0.5, "red.thickness": 0.4}
+    if per_vertex:
+        for item in scene.objects:
+            waves = np.sin(4.0 * item.vertices).astype(np.float32)
+            item.color, item.opacity = 0.5 + 0.4 * waves, 0.5 + 0.3 * waves[:, 0]
+            item.thickness, item.thickness_unit = 3e5, "P"
+        parameters["red.thickness"] = 2e5
+    else:
+        parameters |= {"red.opacity": 0.7, "green.color": [0.3, 0.4, 0.5]}
     problem = Problem(make_study(parameters, scene=scene, count=1))
     view, start = problem.views[0], problem.start()
     evaluation = Evaluation(problem, RobustLoss.named("l2", 1.0), start).views[0]
@@ -124,7 +139,7 @@ def test_motion_columns_are_autograd(name):
         (image @ torch.tensor(weights)).backward()
         unit = next(v.unit for v in variables if v.name == name)
         # Spheres of one opacity: that of the image is the same wherever they are.
-        assert channel == 3 or np.abs(columns).max() > 1e-3
+        assert (channel == 3 and not per_vertex) or np.abs(columns).max() > 1e-3
         np.testing.assert_allclose(weights @ columns, leaves[name].grad.numpy() * unit, rtol=2e-3, atol=2e-4)
 
 
@@ -181,6 +196,62 @@ def test_batches_visit_all_views_and_resume(tmp_path):
     values = {name: torch.as_tensor(value) for name, value in whole.found.items()}
     full = np.mean([float(view.loss(view.image(values))) for view in problem.views])
     assert whole.loss == pytest.approx(full, rel=1e-6)
+
+
+def test_batches_are_parts_of_rounds():
+    """In each round every view has its turn once, in an order of its own; a batch's loss is the mean of its views'."""
+    study = make_study({"red.color": [0.5, 0.5, 0.5]}, method="adam", batch=2, count=5, steps=9)
+    problem = Problem(study)
+    adam = Adam(problem, Session(study, "", None, None, 0.0))
+    seen, losses = [], []
+    original = adam.evaluate
+
+    def evaluate(views):
+        seen.append(views)
+        losses.append(original(views))
+        alone = [original([view]) for view in views]
+        assert losses[-1] == pytest.approx(np.mean(alone), rel=1e-12)
+        return original(views)
+
+    adam.evaluate = evaluate
+    adam.run(problem.start())
+    rounds = [seen[first : first + 3] for first in (0, 3, 6)]
+    for each in rounds:
+        assert sorted(view for batch in each for view in batch) == list(range(5))
+    assert rounds[0] != rounds[1]
+
+
+def test_more_steps_of_batches_are_another_fit(tmp_path):
+    """The last step looks at all views, which decides when to stop: a checkpoint of fewer steps is refused."""
+    study = make_study({"red.color": [0.5, 0.5, 0.5]}, method="adam", batch=2, steps=2)
+    fit(study, output=tmp_path)
+    with pytest.raises(FitError, match="another study"):
+        fit(replace(study, steps=4), output=tmp_path, resume=True)
+
+
+def test_a_wish_to_stop_is_one_in_all_processes(tmp_path):
+    """Ctrl-C in one of them stops each at the end of the same step, with a checkpoint."""
+
+    class Two(Processes):
+        """Two processes, the other of which has been interrupted."""
+
+        def __init__(self):
+            self.count, self.rank, self.device = 2, 0, "cpu"
+
+        def sum(self, vector):
+            return vector + 1.0
+
+    study = make_study({"beta": 0.5})
+    session = Session(study, "", tmp_path, None, 0.0, Two())
+    with pytest.raises(KeyboardInterrupt):
+        session.step(1.0, {"beta": 0.5}, lambda: {"coordinates": np.zeros(1)})
+    assert (tmp_path / "checkpoint.dat").is_file()
+
+
+def test_held_out_views_share_the_references_values():
+    """True values stacked by view say nothing of a view that is held out."""
+    with pytest.raises(StudyError, match=r"reference\.true\.camera\.rotation: found one value per view"):
+        make_study({"beta": 0.5}, true={"camera.rotation": np.ones((2, 3))}, held_out=1)
 
 
 def test_held_out_views_cannot_have_their_own_values():

@@ -131,7 +131,6 @@ MISTAKES = [
     ("scene = ", "scales = 0\nscene = ", "scales: found 0"),
     ("scene = ", "patience = 0\nscene = ", "patience: found 0"),
     ("scene = ", 'method = "adam"\nbatch = 2\nscene = ', "batch: found 2, expected up to 1"),
-    ("scene = ", 'loss = "l3"\nscene = ', 'loss: found "l3"'),
     ("scene = ", "loss = {ssim = 0}\nscene = ", "loss.ssim: found 0"),
     ("scene = ", 'method = "least_squares"\nloss = "ssim"\nscene = ', 'with "least_squares"'),
     ("beta = 0.4", "beta = 1.4", "reference.true.beta: found 1.4"),
@@ -190,6 +189,28 @@ def test_nothing_to_fit():
         Study(spheres(), Reference(), {"beta": 0.5})
     with pytest.raises(StudyError, match="options of a render"):
         Study(spheres(), Reference(image=np.zeros((36, 40, 3)), supersampling=2), {"beta": 0.5})
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"merge": "bogus"}, 'reference.merge: found "bogus", expected "none"'),
+        ({"mix": "bogus"}, 'reference.mix: found "bogus"'),
+        ({"layers": 0}, "reference.layers: found 0, expected a whole number from 1"),
+    ],
+)
+def test_options_of_a_reference_are_checked(options, words):
+    """With the study, not when the reference is rendered."""
+    with pytest.raises(StudyError, match=words):
+        Study(spheres(), Reference(true={}, **options), {"beta": 0.5})
+
+
+def test_a_k_buffers_reference_takes_what_a_k_buffer_does():
+    """Smooth merging is none of it."""
+    scene = replace(spheres(), merge="order_independent")
+    options = {"parameters": {"red.thickness": 0.5}, "resolve": "kbuffer"}
+    with pytest.raises(StudyError, match=r'reference\.merge: found "smooth", .* with resolve "kbuffer"'):
+        Study(scene, Reference(true={}, merge="smooth"), **options)
 
 
 def test_one_value_may_be_asked_for(folder):
