@@ -139,7 +139,7 @@ def test_standard_errors_are_those_of_repeated_fits():
 @pytest.mark.parametrize("options", [{"loss": "l2"}, {"loss": "l1"}, {"loss": "huber", "delta": 1e-3}, {"scales": 3}])
 def test_certainty_is_that_of_what_objects_cover(options):
     """Whatever the loss and its scales, and whatever the reference has where no object is."""
-    study = make_study({"beta": 0.5, "red.thickness": 0.3}, steps=1)
+    study = make_study({"beta": 0.5, "red.thickness": 0.3})
     clean = Problem(study).views[0].reference
     fragments = Problem(study).views[0].fragments
     covered = (np.diff(fragments.offsets) > 0).reshape(fragments.shape)
@@ -151,8 +151,8 @@ def test_certainty_is_that_of_what_objects_cover(options):
     expected = fit(replace(study, reference=plain)).standard_errors
     found = fit(replace(study, reference=other, **options)).standard_errors
     for name, value in expected.items():
-        # One step of another loss ends elsewhere.
-        assert found[name] == pytest.approx(value, rel=0.3)
+        # Another loss ends elsewhere, by about such an error.
+        assert found[name] == pytest.approx(value, rel=0.05)
 
 
 def test_undetermined_parameters_are_named():

@@ -108,15 +108,15 @@ MOTIONS = {
 }
 
 
-@pytest.mark.parametrize("per_vertex", [False, True])
+@pytest.mark.parametrize(("per_vertex", "opacity"), [(False, True), (True, False), (True, True)])
 @pytest.mark.parametrize("name", MOTIONS)
-def test_motion_columns_are_autograd(name, per_vertex):
+def test_motion_columns_are_autograd(name, per_vertex, opacity):
     """The columns of transforms and cameras are what torch says for each pixel, with coverage held fixed.
 
     Per vertex, what moves with its surface is colour, opacity and a thickness in P(z) that is fitted.
     """
     scene = replace(spheres(), background=(0.4, 0.3, 0.2, 0.5))
-    parameters = {**MOTIONS, "beta": 0.5, "red.thickness": 0.4}
+    parameters = {**MOTIONS, "beta": 0.5, "red.thickness": 0.4} | ({"red.opacity": 0.7} if opacity else {})
     if per_vertex:
         for item in scene.objects:
             waves = np.sin(4.0 * item.vertices).astype(np.float32)
@@ -124,7 +124,7 @@ def test_motion_columns_are_autograd(name, per_vertex):
             item.thickness, item.thickness_unit = 3e5, "P"
         parameters["red.thickness"] = 2e5
     else:
-        parameters |= {"red.opacity": 0.7, "green.color": [0.3, 0.4, 0.5]}
+        parameters["green.color"] = [0.3, 0.4, 0.5]
     problem = Problem(make_study(parameters, scene=scene, count=1))
     view, start = problem.views[0], problem.start()
     evaluation = Evaluation(problem, RobustLoss.named("l2", 1.0), start).views[0]
@@ -138,8 +138,8 @@ def test_motion_columns_are_autograd(name, per_vertex):
         image = view.image(leaves)[..., channel].double().reshape(-1)
         (image @ torch.tensor(weights)).backward()
         unit = next(v.unit for v in variables if v.name == name)
-        # Spheres of one opacity: that of the image is the same wherever they are.
-        assert (channel == 3 and not per_vertex) or np.abs(columns).max() > 1e-3
+        # A sphere of one opacity: that of the image is the same wherever it is.
+        assert (channel == 3 and (opacity or not per_vertex)) or np.abs(columns).max() > 1e-3
         np.testing.assert_allclose(weights @ columns, leaves[name].grad.numpy() * unit, rtol=2e-3, atol=2e-4)
 
 
