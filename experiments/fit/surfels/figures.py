@@ -94,7 +94,7 @@ def curves(
             left.plot(multiples, levels[1:], color=COLORS[discs], ls=style, lw=1.3, label=f"{discs}, {name}")
         left.set(ylabel="mean PSNR of held-out views [dB]")
         left.set_title("(a) Colours of the mesh")
-        left.legend(loc="center left", bbox_to_anchor=(0.0, 0.55))
+        left.legend(loc="lower left")
         shades = ("#9ecae1", "#4292c6", "#08306b")
         for shade, (count, levels) in zip(shades, by_count.items(), strict=True):
             middle.plot(multiples, levels[1:] - levels[0], color=shade, lw=1.3, label=f"{count} points")
