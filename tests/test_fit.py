@@ -37,7 +37,7 @@ def test_frozen_geometry_renders_the_same_image(background):
     whole = render(problem.views[0].scene, parameters={name: np.float32(value) for name, value in values.items()})
     view = problem.views[0]
     np.testing.assert_allclose(view.image(values), whole, atol=0.0)
-    scaled = view.unit.scaled(view.parameters(values), problem.study.variables)
+    scaled = view.unit.scaled(*view.unit.scales(view.parameters(values)))
     image = view.over_background(view.composite(scaled, np.float32(0.4)))
     np.testing.assert_allclose(image, whole, atol=2e-6)
 

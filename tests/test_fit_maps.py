@@ -79,9 +79,7 @@ def test_gradient_of_a_loss_with_a_prior():
     study = make_study(parameters, scene=scene, method="adam", steps=4)
     problem = Problem(study)
     adam = Adam(problem, Session(study, "", None, None, 0.0))
-    adam.begin = 0
-    adam.best_loss, adam.best, adam.evaluations = np.inf, problem.start(), 0
-    adam._enter(0, problem.start(), 2)
+    adam.begin(problem.start())
     loss = adam.evaluate([0])
     leaf = adam.coordinates[0].leaf
     slopes = leaf.grad.clone()

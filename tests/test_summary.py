@@ -84,6 +84,13 @@ def test_save_rewrites_the_marked_part(folder):
     assert contents(folder.parent) == before
 
 
+def test_headline_is_the_first_paragraph():
+    """What stands in overviews; the README has all of it."""
+    summary = replace(SUMMARY, answer="Twice 1.5.\n\nMore of it.")
+    assert summary.headline == "Twice 1.5."
+    assert "More of it." in summary.markdown()
+
+
 def test_load_returns_what_was_saved(folder):
     """The file is results/fit/<name>/summary.json, or in another folder of results."""
     SUMMARY.save(folder)

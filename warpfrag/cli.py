@@ -260,7 +260,7 @@ def _run_studies(study: Path | None, source: Path | None, output: Path | None) -
             raise typer.Exit(_complain(f"stopped in {words}; the report is not written", 130)) from None
         runs.append(run)
         if run.summary is not None:
-            print(f"{run.name}: {run.summary.answer} ({duration(run.seconds)})")
+            print(f"{run.name}: {run.summary.headline} ({duration(run.seconds)})")
         else:
             _complain(f"{run.name}: {run.error} (more in {RESULTS / run.name / LOG})", 1)
     shown = write_gallery(runs, target / "report.html")

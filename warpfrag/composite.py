@@ -18,7 +18,7 @@ import warp as wp
 
 from warpfrag.fragments import Fragments, Layers
 from warpfrag.interop.launch import Span, launch
-from warpfrag.interop.operator import Operator, apply
+from warpfrag.interop.operator import Operator, apply, vectors
 from warpfrag.resolve.arguments import (
     FRAGMENT_DIFFERENTIABLE,
     FRAGMENT_TENSORS,
@@ -32,7 +32,6 @@ from warpfrag.resolve.arguments import (
     as_int32,
     check_options,
     fragment_inputs,
-    vectors,
 )
 from warpfrag.resolve.exact import COMPOSITE_EXACT, apply_exact
 from warpfrag.resolve.walk import (

@@ -61,6 +61,11 @@ class Fragments:
         return math.prod(self.shape)
 
     @property
+    def pixel(self) -> np.ndarray:
+        """The pixel of each fragment, (F,), a NumPy array."""
+        return np.repeat(np.arange(self.pixel_count), np.diff(_to_numpy(self.offsets)))
+
+    @property
     def kind(self) -> str:
         """Kind of the arrays: "torch", "warp" or "numpy"."""
         return common_kind({"rgba": self.rgba})

@@ -70,7 +70,7 @@ OTHERS: dict[str, Method] = {
 def capture(scene: wf.Scene) -> Capture:
     """Capture a scene once, and sort a copy of its fragments."""
     stream = wf.capture(scene, sort=False)
-    owner = np.repeat(np.arange(stream.pixel_count), np.diff(stream.offsets))
+    owner = stream.pixel
     # Stable: fragments of equal depth stay in order of submission.
     order = np.lexsort((stream.depth, owner))
     names = ("rgba", "depth", "thickness", "object_id", "primitive_id")

@@ -36,7 +36,7 @@ def array_module(fragments: Fragments) -> Any:
 def owners(fragments: Fragments) -> Any:
     """Return the pixel that each fragment belongs to, (F,)."""
     if fragments.kind == "numpy":
-        return np.repeat(np.arange(fragments.pixel_count), np.diff(fragments.offsets))
+        return fragments.pixel
     import torch
 
     counts = fragments.offsets.diff()

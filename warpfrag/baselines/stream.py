@@ -10,8 +10,8 @@ import warp as wp
 
 from warpfrag.fragments import Fragments
 from warpfrag.interop.launch import launch, worker_count
-from warpfrag.interop.operator import Operator, apply, kind_of
-from warpfrag.resolve.arguments import as_int32, vectors
+from warpfrag.interop.operator import Operator, apply, kind_of, vectors
+from warpfrag.resolve.arguments import as_int32
 
 
 def stream_operator(

@@ -27,11 +27,11 @@ from warpfrag.capture.capture import (
     to_warp,
 )
 from warpfrag.capture.fragment_adjoint import fragment_adjoint, load_triangle
-from warpfrag.capture.ray import Rays, Window, centre_x, centre_y, vectors
+from warpfrag.capture.ray import Rays, Window, centre_x, centre_y
 from warpfrag.capture.shade import present
 from warpfrag.fragments import Fragments
 from warpfrag.interop.launch import Span, launch
-from warpfrag.interop.operator import dtype_name, kind_of
+from warpfrag.interop.operator import dtype_name, kind_of, vectors
 from warpfrag.scene.camera import Camera
 from warpfrag.scene.geometry import assemble
 from warpfrag.scene.objects import Scene

@@ -25,9 +25,9 @@ from warpfrag.capture.ray import (
     is_wide,
     load_point,
     stretch,
-    vectors,
 )
 from warpfrag.interop.launch import Span, launch
+from warpfrag.interop.operator import vectors
 
 wp.set_module_options({"enable_backward": False})
 

@@ -96,16 +96,6 @@ class Window:
         return rays
 
 
-def vectors(array: wp.array) -> wp.array:
-    """Return a Warp array of shape (n, k) as an array of n vectors, which kernels load at once; shares its memory."""
-    size, length = array.shape
-    dtype = wp.types.vector(length, array.dtype)
-    view = wp.array(ptr=array.ptr, dtype=dtype, shape=(size,), device=array.device, capacity=array.capacity)
-    # A view by address does not keep its memory alive by itself.
-    view._ref = array
-    return view
-
-
 @wp.func
 def load_point(points: Any, vertex: int) -> wp.vec3d:
     """Return a corner in camera space."""

@@ -29,10 +29,10 @@ from warpfrag.capture.ray import (
     planar_depth,
     seen_from,
     stretch,
-    vectors,
 )
 from warpfrag.capture.texture import load_rgba, load_uv, look_up, mix3, texel_between
 from warpfrag.interop.launch import Span, launch
+from warpfrag.interop.operator import vectors
 
 wp.set_module_options({"enable_backward": False})
 

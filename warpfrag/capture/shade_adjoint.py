@@ -29,7 +29,6 @@ from warpfrag.capture.ray import (
     is_wide,
     load_point,
     stretch,
-    vectors,
 )
 from warpfrag.capture.shade import (
     OBJECT_IN_P,
@@ -46,7 +45,7 @@ from warpfrag.capture.shade import (
 )
 from warpfrag.capture.strips import cut_strips, gather_corners, rows_of_strip
 from warpfrag.interop.launch import Span, launch
-from warpfrag.interop.operator import Operator
+from warpfrag.interop.operator import Operator, vectors
 
 wp.set_module_options({"enable_backward": False})
 

@@ -14,20 +14,10 @@ import warp as wp
 
 from warpfrag.capture.occupancy import WORD_BITS, bucket_of, last_bucket, set_bucket
 from warpfrag.capture.raster import BAND_ROWS, Triangles, list_by_band
-from warpfrag.capture.ray import (
-    ZERO,
-    Rays,
-    centre_x,
-    centre_y,
-    columns_of_row,
-    hit_depth,
-    is_wide,
-    load_point,
-    stretch,
-    vectors,
-)
+from warpfrag.capture.ray import ZERO, Rays, centre_x, centre_y, columns_of_row, hit_depth, is_wide, load_point, stretch
 from warpfrag.capture.shade import SHADE_TENSORS, hit_weights, present, shade_color, shade_thickness
 from warpfrag.interop.launch import Span, launch
+from warpfrag.interop.operator import vectors
 from warpfrag.resolve.slots import SLOTS, finish_slots, insert, is_beyond, slots_in
 
 wp.set_module_options({"enable_backward": False})

@@ -8,8 +8,8 @@ import numpy as np
 import warp as wp
 
 from warpfrag.capture.raster import MOST_FRAGMENTS
-from warpfrag.capture.ray import vectors
 from warpfrag.interop.launch import Span, launch
+from warpfrag.interop.operator import vectors
 
 wp.set_module_options({"enable_backward": False})
 

@@ -11,8 +11,9 @@ several processes each computes the loss of its share of the views; what they ex
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
@@ -65,6 +66,40 @@ class _Coordinate:
             self.leaf.data.clamp_(self.lower, self.upper)
 
 
+@dataclass
+class _Course:
+    """Where the fit from one start has come to, but for leaves and optimiser.
+
+    Attributes:
+        begin: steps of all starts before it.
+        best: coordinates of the least loss.
+        best_loss: the least loss.
+        evaluations: times that the images were computed.
+        stage: of the maps' grids.
+        stage_end: steps from this start after which the stage ends.
+        scores: losses in this stage that the stopping rule goes by.
+    """
+
+    begin: int
+    best: np.ndarray
+    best_loss: float = math.inf
+    evaluations: int = 0
+    stage: int = 0
+    stage_end: int = 0
+    scores: list[float] = field(default_factory=list)
+
+    def to_state(self) -> dict[str, Any]:
+        """Return it as a checkpoint keeps it."""
+        import torch
+
+        return {**vars(self), "best": torch.tensor(self.best), "scores": list(self.scores)}
+
+    @staticmethod
+    def from_state(state: Mapping[str, Any]) -> "_Course":
+        """Return what `to_state` has made a state of."""
+        return _Course(**{**state, "best": state["best"].cpu().numpy(), "scores": list(state["scores"])})
+
+
 class Descent(ABC):
     """What both methods share: loss and gradient, stages, the best so far, state to and from checkpoints.
 
@@ -110,21 +145,19 @@ class Descent(ABC):
 
     def _run(self, start: np.ndarray) -> Outcome:
         steps = int(self.study.steps or 0)
-        self.begin = len(self.session.losses)
-        self.evaluations, self.best_loss, self.best = 0, math.inf, start
-        self._enter(0, start, steps // self.stages)
+        self.begin(start)
         if self.index < len(self.states):
             self._restore(self.states[self.index])
         converged, reason = False, "the largest number of steps was reached"
         while True:
             why = self.settled()
-            last = self.stage + 1 == self.stages
+            last = self.course.stage + 1 == self.stages
             if last and (why is not None or self.done >= steps):
                 converged, reason = why is not None, why or reason
                 break
-            if not last and (why is not None or self.done >= self.stage_end):
-                left = (steps - self.done) // (self.stages - self.stage - 1)
-                self._enter(self.stage + 1, self.vector(), self.done + left)
+            if not last and (why is not None or self.done >= self.course.stage_end):
+                left = (steps - self.done) // (self.stages - self.course.stage - 1)
+                self._enter(self.course.stage + 1, self.vector(), self.done + left)
                 continue
             values = self.values()
             loss = self.step()
@@ -134,12 +167,18 @@ class Descent(ABC):
             self.session.step(loss, values, self._state)
         self.session.state = self._state()
         self.states = self.session.state["runs"]
-        return Outcome(self.best, self.best_loss, converged, reason, self.evaluations)
+        course = self.course
+        return Outcome(course.best, course.best_loss, converged, reason, course.evaluations)
+
+    def begin(self, start: np.ndarray) -> None:
+        """Begin the course from a start, in the first stage."""
+        self.course = _Course(len(self.session.losses), start)
+        self._enter(0, start, int(self.study.steps or 0) // self.stages)
 
     @property
     def done(self) -> int:
         """Steps done from this start."""
-        return len(self.session.losses) - self.begin
+        return len(self.session.losses) - self.course.begin
 
     def evaluate(self, views: list[int]) -> Any:
         """Compute the loss of some views and its gradient in the leaves.
@@ -172,7 +211,7 @@ class Descent(ABC):
         torch.autograd.backward(
             [*outward.values(), *priors], [*gradients, *(torch.ones_like(prior) for prior in priors)]
         )
-        self.evaluations += 1
+        self.course.evaluations += 1
         return total + sum(float(prior.detach()) for prior in priors)
 
     def _over_processes(self, total: float, gradients: list[Any]) -> tuple[float, list[Any]]:
@@ -210,17 +249,16 @@ class Descent(ABC):
 
     def keep(self, loss: float) -> None:
         """Keep the coordinates if none before had a smaller loss."""
-        if loss < self.best_loss:
-            self.best_loss, self.best = loss, self.vector()
+        if loss < self.course.best_loss:
+            self.course.best_loss, self.course.best = loss, self.vector()
 
     def _score(self, loss: float) -> None:
         """Take note of the loss that the stopping rule goes by."""
-        self.scores.append(loss)
+        self.course.scores.append(loss)
 
     def _enter(self, stage: int, vector: np.ndarray, end: int) -> None:
         """Begin a stage from a vector of coordinates."""
-        self.stage, self.stage_end = stage, end
-        self.scores: list[float] = []
+        self.course.stage, self.course.stage_end, self.course.scores = stage, end, []
         for coordinate, (_, place) in zip(self.coordinates, placed(self.study.variables), strict=True):
             coordinate.put(vector[place], stage)
         self.torch_optimizer = self.optimizer()
@@ -230,21 +268,20 @@ class Descent(ABC):
         current = {
             "leaves": [coordinate.leaf.detach().clone() for coordinate in self.coordinates],
             "optimizer": self.torch_optimizer.state_dict(),
-            **{"losses": self.session.losses[self.begin :], "scores": list(self.scores)},
-            **{"stage": self.stage, "stage_end": self.stage_end, "evaluations": self.evaluations},
-            **{"best_loss": self.best_loss, "best": self.torch.tensor(self.best)},
+            "losses": self.session.losses[self.course.begin :],
+            "course": self.course.to_state(),
         }
         return {"runs": [*self.states[: self.index], current, *self.states[self.index + 1 :]]}
 
     def _restore(self, state: dict[str, Any]) -> None:
         """Take up where a checkpoint was written."""
-        self._enter(state["stage"], self.vector(), state["stage_end"])
+        course = _Course.from_state(state["course"])
+        self._enter(course.stage, self.vector(), course.stage_end)
+        self.course = course
         for coordinate, leaf in zip(self.coordinates, state["leaves"], strict=True):
             coordinate.leaf.data.copy_(leaf)
         self.torch_optimizer.load_state_dict(state["optimizer"])
         self.session.losses += state["losses"]
-        self.scores, self.evaluations = state["scores"], state["evaluations"]
-        self.best_loss, self.best = state["best_loss"], state["best"].cpu().numpy()
 
 
 class Adam(Descent):
@@ -271,9 +308,9 @@ class Adam(Descent):
     def settled(self) -> str | None:
         """Return why the stage has come to its end, if it has."""
         patience = -(-int(self.study.patience or 1) // self._round)
-        if len(self.scores) <= patience:
+        if len(self.course.scores) <= patience:
             return None
-        best, before = min(self.scores[-patience:]), min(self.scores[:-patience])
+        best, before = min(self.course.scores[-patience:]), min(self.course.scores[:-patience])
         stalled = best >= (1.0 - self.study.tolerance) * before
         return f"{self.study.patience} steps brought nothing better" if stalled else None
 
@@ -292,11 +329,11 @@ class Adam(Descent):
 
     def _score(self, loss: float) -> None:
         if self.study.batch is None:
-            self.scores.append(loss)
+            self.course.scores.append(loss)
         # The step at hand is not yet in the history.
         elif (self.done + 1) % self._round == 0 or self.done + 1 == self.study.steps:
             full = self.full_loss()
-            self.scores.append(full)
+            self.course.scores.append(full)
             self.keep(full)
 
 
@@ -326,9 +363,9 @@ class LBFGS(Descent):
     def settled(self) -> str | None:
         """Return why the stage has come to its end, if it has."""
         patience = int(self.study.patience or 1)
-        if len(self.scores) <= patience:
+        if len(self.course.scores) <= patience:
             return None
-        recent = self.scores[-patience - 1 :]
+        recent = self.course.scores[-patience - 1 :]
         same = all(abs(a - b) <= self.study.tolerance * abs(a) for a, b in pairwise(recent))
         return "the loss stopped changing" if same else None
 

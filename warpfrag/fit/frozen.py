@@ -30,6 +30,7 @@ class UnitFragments:
     def __init__(
         self, scene: Scene, coverage: Coverage, variables: Sequence[Variable], moved: Mapping[str, Any] | None = None
     ) -> None:
+        self.variables = variables
         ones = {v.name: np.ones(v.start.shape, np.float32) for v in variables if v.key != "beta" and not v.moves}
         # What the fragments were shaded with.
         self.parameters = {**ones, **(moved or {})}
@@ -37,22 +38,17 @@ class UnitFragments:
         self.names = [item.name for item in scene.objects]
         self.objects = np.asarray(self.fragments.object_id)
 
-    def owned(self, name: str, fitted: Sequence[Variable]) -> list[int]:
-        """Return the objects that a parameter is a value of.
-
-        Args:
-            name: the parameter.
-            fitted: all fitted parameters: a thickness of the scene is that of the objects without one of their own.
-        """
+    def owned(self, name: str) -> list[int]:
+        """Return the objects that a parameter is a value of; one of the scene, of those without one of their own."""
         owner, _, key = name.rpartition(".")
-        own = {v.owner for v in fitted if v.key == key}
+        own = {v.owner for v in self.variables if v.key == key}
         return [i for i, item in enumerate(self.names) if (item == owner if owner else item not in own)]
 
-    def scales(self, values: Mapping[str, Any], fitted: Sequence[Variable]) -> tuple[np.ndarray, np.ndarray]:
+    def scales(self, values: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
         """Return each object's colour and opacity, (objects, 4), and thickness, (objects,); 1 where not fitted."""
         rgba, thickness = np.ones((len(self.names), 4), np.float32), np.ones(len(self.names), np.float32)
-        for variable in fitted:
-            owned, value = self.owned(variable.name, fitted), np.asarray(values.get(variable.name, 1.0))
+        for variable in self.variables:
+            owned, value = self.owned(variable.name), np.asarray(values.get(variable.name, 1.0))
             if variable.key == "color":
                 rgba[owned, :3] = value
             elif variable.key == "opacity":
@@ -61,9 +57,8 @@ class UnitFragments:
                 thickness[owned] = value
         return rgba, thickness
 
-    def scaled(self, values: Mapping[str, Any], fitted: Sequence[Variable]) -> Fragments:
-        """Return the fragments for parameter values."""
-        rgba, thickness = self.scales(values, fitted)
+    def scaled(self, rgba: np.ndarray, thickness: np.ndarray) -> Fragments:
+        """Return the fragments for what `scales` gives."""
         unit, factors = self.fragments, premultiplied(rgba)[self.objects]
         return replace(unit, rgba=unit.rgba * factors, thickness=unit.thickness * thickness[self.objects])
 

@@ -94,7 +94,7 @@ def _row(run: StudyRun) -> str:
     else:
         markdown = _markdown(run.folder, run.summary)
         link = f'<a href="#{escape(run.name)}">{escape(run.summary.title)}</a>'
-        cells = [link, *(markdown.renderInline(text) for text in (run.summary.question, run.summary.answer))]
+        cells = [link, *(markdown.renderInline(text) for text in (run.summary.question, run.summary.headline))]
         status = "done"
     cells += [duration(run.seconds), f'<span class="{status}">{status}</span>']
     return f"<tr>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>"

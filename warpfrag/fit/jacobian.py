@@ -107,7 +107,9 @@ class ViewEvaluation:
         keys = {variable.key for variable in self.variables}
         # A scene that is out of sight has no fragments to differentiate by.
         keys = keys if self.unit.fragments.count else set()
-        self.fragments = self.unit.scaled(self.values, self.variables)
+        # Of each object: straight colour and opacity, and thickness.
+        self.object_rgba, self.object_thickness = self.unit.scales(self.values)
+        self.fragments = self.unit.scaled(self.object_rgba, self.object_thickness)
         device = problem.device
         # Beta as one value per pixel, so that its gradient stays apart by pixel.
         beta = np.full(problem.scene.camera.shape, self.values.get("beta", problem.scene.beta), np.float32)
@@ -186,7 +188,7 @@ class ViewEvaluation:
         columns = np.full((len(self.unit.names), 3), -1, np.int32)
         for variable, place in placed(self.variables):
             if variable.key in _KINDS:
-                columns[self.unit.owned(variable.name, self.variables), _KINDS.index(variable.key)] = place.start
+                columns[self.unit.owned(variable.name), _KINDS.index(variable.key)] = place.start
         return columns
 
     def _sum_objects(self, sums: np.ndarray) -> None:
@@ -201,7 +203,7 @@ class ViewEvaluation:
             wp.array(self.fragments.offsets, dtype=int, device=device, copy=False),
             wp.array(unit.objects, dtype=int, device=device, copy=False),
             wp.array(self._columns, dtype=wp.vec3i, device=device),
-            wp.array(unit.scales(self.values, self.variables)[0], dtype=wp.vec4f, device=device),
+            wp.array(self.object_rgba, dtype=wp.vec4f, device=device),
             wp.array(unit.fragments.rgba, dtype=wp.vec4f, device=device, copy=False),
             self.thickness,
             none if self.rgba.grad is None else self.rgba.grad.view(wp.vec4f),
@@ -229,12 +231,11 @@ class ViewEvaluation:
     def _sum_motions(self, sums: np.ndarray) -> None:
         """Add what transforms of objects and of the camera contribute, by pixel."""
         unit = self.unit
-        rgba_scale, thickness_scale = unit.scales(self.values, self.variables)
         motions = self.coverage.motion_gradients(
             unit.parameters,
-            self.rgba.grad.numpy() * premultiplied(rgba_scale)[unit.objects],
+            self.rgba.grad.numpy() * premultiplied(self.object_rgba)[unit.objects],
             self.depth.grad.numpy(),
-            self.thickness.grad.numpy() * thickness_scale[unit.objects],
+            self.thickness.grad.numpy() * self.object_thickness[unit.objects],
         )
         for begin, members, matrix in self._motions:
             for index, column in enumerate((motions[members] @ matrix).T):
@@ -243,8 +244,7 @@ class ViewEvaluation:
     @cached_property
     def _pixels(self) -> np.ndarray:
         """The pixel of each fragment."""
-        offsets = np.asarray(self.fragments.offsets)
-        return np.repeat(np.arange(offsets.size - 1), np.diff(offsets))
+        return self.fragments.pixel
 
 
 class Evaluation:

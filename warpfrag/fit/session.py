@@ -27,7 +27,7 @@ from warpfrag.saving import replacing
 
 CHECKPOINT = "checkpoint.dat"
 # Of the file's layout; another one is not read.
-_VERSION = 2
+_VERSION = 3
 
 
 class FitError(ValueError):

@@ -103,7 +103,7 @@ class Summary:
         name: of the study: letters, digits, "_" and "-"; that of its folder.
         title: a few words.
         question: one sentence.
-        answer: one or two sentences with the numbers measured.
+        answer: a few sentences with the numbers measured; its first paragraph stands for it in overviews.
         tables: in the order of the README.
         figures: those of the study; the README shows them where it likes.
         numbers: by name, what a check compares when the study is run again; finite.
@@ -125,6 +125,11 @@ class Summary:
         object.__setattr__(self, "tables", tuple(self.tables))
         object.__setattr__(self, "figures", tuple(self.figures))
         object.__setattr__(self, "numbers", {name: _number(name, value) for name, value in self.numbers.items()})
+
+    @property
+    def headline(self) -> str:
+        """The first paragraph of the answer."""
+        return self.answer.strip().split("\n\n")[0]
 
     def markdown(self) -> str:
         """Return what the README shows between its markers: the answer and the tables, some of them folded."""

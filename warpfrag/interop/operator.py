@@ -110,6 +110,16 @@ def float_type(inputs: Sequence[Any]) -> Any:
     return next(a.dtype for a in inputs if a is not None and a.dtype in (wp.float32, wp.float64))
 
 
+def vectors(array: wp.array) -> wp.array:
+    """Return a Warp array of shape (n, k) as an array of n vectors, which kernels load at once; shares its memory."""
+    size, length = array.shape
+    dtype = wp.types.vector(length, array.dtype)
+    view = wp.array(ptr=array.ptr, dtype=dtype, shape=(size,), device=array.device, capacity=array.capacity)
+    # A view by address does not keep its memory alive by itself.
+    view._ref = array
+    return view
+
+
 def _allocate(operator: Operator, inputs: Sequence[Any], options: Mapping[str, Any], requires_grad: bool) -> tuple:
     scalar = float_type(inputs)
     device = next(a.device for a in inputs if a is not None)

@@ -9,7 +9,7 @@ import warp as wp
 
 from warpfrag.fragments import Fragments
 from warpfrag.interop.launch import Span, launch, worker_count
-from warpfrag.interop.operator import dtype_name, kind_of
+from warpfrag.interop.operator import dtype_name, kind_of, vectors
 from warpfrag.operators import MIX_AVERAGE, MIX_OPACITY, MIX_OPTICAL_DEPTH
 from warpfrag.resolve.walk import (
     MERGE_EXACT,
@@ -137,12 +137,6 @@ def beta_array(beta: Any, like: Any, shape: tuple[int, ...], fragment_count: int
         hint = "" if fragment_count is not None else "; one per fragment goes with merge 'exact'"
         raise ValueError(f"beta: got shape {tuple(beta.shape)}, expected {expected}{hint}")
     return beta.reshape((math.prod(beta.shape),))
-
-
-def vectors(array: wp.array) -> wp.array:
-    """Return an array of shape (n, 4) as one of n vectors, sharing its memory."""
-    dtype = wp.types.vector(4, array.dtype)
-    return wp.array(ptr=array.ptr, dtype=dtype, shape=array.shape[:1], device=array.device)
 
 
 class Walk:

@@ -19,7 +19,7 @@ import warp as wp
 
 from warpfrag.fragments import Fragments, Layers
 from warpfrag.interop.launch import Span, launch, worker_count
-from warpfrag.interop.operator import Operator, apply
+from warpfrag.interop.operator import Operator, apply, vectors
 from warpfrag.resolve.arguments import (
     GRADIENTS,
     PIXELS,
@@ -28,7 +28,6 @@ from warpfrag.resolve.arguments import (
     longest_list,
     report_invalid,
     row_length,
-    vectors,
 )
 from warpfrag.resolve.members import ZERO, Members, layer_of, member_adjoint, no_members, with_member
 from warpfrag.resolve.slots import OWNS_SLOT, SLOTS, TAIL_IN_USE, finish_slots, insert, slots_in

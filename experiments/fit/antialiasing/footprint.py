@@ -102,7 +102,7 @@ def slopes_of(scene: wf.Scene, fragments: wf.Fragments) -> tuple[np.ndarray, np.
     camera = scene.camera
     height, width = camera.shape
     normals, offsets = _planes(scene, fragments)
-    row, column = np.divmod(pixel_of(fragments), width)
+    row, column = np.divmod(fragments.pixel, width)
     x, y = (column + 0.5 - width / 2) / camera.focal, (row + 0.5 - height / 2) / camera.focal
     # The ray through (x, y, 1) of length L meets the plane at depth k·L/(n·ray); differentiated by x and y.
     length = np.sqrt(x * x + y * y + 1.0)
@@ -115,17 +115,11 @@ def slopes_of(scene: wf.Scene, fragments: wf.Fragments) -> tuple[np.ndarray, np.
 def padded(fragments: wf.Fragments, values: np.ndarray, fill: float = 0.0) -> np.ndarray:
     """Return values of fragments by pixel and place in its list, (P, K, ...)."""
     counts = np.diff(fragments.offsets)
-    pixel = pixel_of(fragments)
+    pixel = fragments.pixel
     place = np.arange(fragments.count) - fragments.offsets[:-1][pixel]
     result = np.full((counts.size, max(counts.max(initial=0), 1), *values.shape[1:]), fill, values.dtype)
     result[pixel, place] = values
     return result
-
-
-def pixel_of(fragments: wf.Fragments) -> np.ndarray:
-    """Return the pixel of each fragment, (F,)."""
-    counts = np.diff(fragments.offsets)
-    return np.repeat(np.arange(counts.size), counts)
 
 
 def _row_of_pixels(scene: wf.Scene, fragments: wf.Fragments, samples: int) -> tuple[np.ndarray, np.ndarray]:

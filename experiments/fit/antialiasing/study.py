@@ -15,10 +15,11 @@ import warp as wp
 wp.config.log_level = wp.LOG_WARNING
 
 import figures  # noqa: E402
-from footprint import intersection_band, nearest_pairs, pixel_of, slopes_of  # noqa: E402
+from footprint import intersection_band, nearest_pairs, slopes_of  # noqa: E402
 from scipy.optimize import minimize_scalar  # noqa: E402
 
 import warpfrag as wf  # noqa: E402
+from warpfrag.capture.render import over_background  # noqa: E402
 from warpfrag.fit import FitParameter, FitResult, Reference, Study  # noqa: E402
 from warpfrag.fit.losses import psnr  # noqa: E402
 from warpfrag.fit.summary import Figure, Summary, Table  # noqa: E402
@@ -94,7 +95,7 @@ class Case:
         self.crossing, self.band = intersection_band(self.scene, SAMPLES)
         pairs = nearest_pairs(self.scene, self.fragments)
         self.pixel_size, self.footprints = pairs.pixel_size, pairs.footprints()
-        pixel, slopes = pixel_of(self.fragments), slopes_of(self.scene, self.fragments)[0]
+        pixel, slopes = self.fragments.pixel, slopes_of(self.scene, self.fragments)[0]
         near = (pairs.distance <= REACH)[pixel]
         self.units = {name: np.where(near, each[pixel], 0.0) for name, each in self.footprints.items()}
         self.units[OWN] = np.where(near, np.linalg.norm(slopes, axis=1), 0.0)
@@ -115,7 +116,7 @@ class Case:
         each = np.broadcast_to(np.asarray(thickness, np.float32), self.fragments.depth.shape)
         slabs = replace(self.fragments, thickness=np.ascontiguousarray(each))
         image = wf.composite(slabs, beta, max_layers=self.scene.layers, merge="smooth")
-        return image + (1.0 - image[..., 3:]) * np.asarray(self.scene.background, np.float32)
+        return over_background(image, self.scene.background)
 
     def error(self, image: np.ndarray) -> np.ndarray:
         """Return the mean squared difference from the reference over the channels of colour, (H, W)."""
@@ -208,7 +209,7 @@ def render_all(case: Case, factors: dict[str, float]) -> None:
         "none": case.image(0.0),
         "2P": wf.render(replace(scene, objects=p)),
         "hand-set": wf.render(scene),
-        "pixel size": case.image(case.pixel_size[pixel_of(case.fragments)]),
+        "pixel size": case.image(case.pixel_size[case.fragments.pixel]),
         "global": case.fits["scene"].after,
         "per object": case.fits["object"].after,
         "rule": case.by_rule(RULE, factors[RULE]),
@@ -222,7 +223,7 @@ def best_thickness(case: Case) -> dict[str, np.ndarray]:
     Returns:
         "t" of those that tell it clearly, with their footprints by name; and in all "every ratio", t over the rule's.
     """
-    tried, owner = TRIED[:, None] * case.pixel_size, pixel_of(case.fragments)
+    tried, owner = TRIED[:, None] * case.pixel_size, case.fragments.pixel
     errors = np.stack([case.error(case.image(thickness[owner])).reshape(-1) for thickness in tried])
     best, pixel = errors.argmin(axis=0), np.arange(errors.shape[1])
     lowest = errors[best, pixel]
@@ -277,7 +278,7 @@ def summarise(size: int, all_cases: list[Case], factors: dict[str, float], best:
     low, middle, high = quartiles(best, RULE)
     told = sum(len(data["t"]) for data in best.values())
     every = np.concatenate([data["every ratio"] for data in best.values()])
-    everywhere = mean(others, lambda c: c.image(factors[RULE] * c.footprints[RULE][pixel_of(c.fragments)]))
+    everywhere = mean(others, lambda c: c.image(factors[RULE] * c.footprints[RULE][c.fragments.pixel]))
     answer = (
         f"t = {factors[RULE]:.2f}·|g₁ − g₂| for both surfaces, where g is the gradient of a surface's depth along the "
         f"ray from pixel to pixel: the length of the *difference* of the two footprints, neither the pixel size nor "

@@ -87,7 +87,7 @@ def shown(images: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 def maps_of(found: dict[str, dict[str, Any]], scene: wf.Scene) -> dict[str, np.ndarray]:
     """Return the maps of the last fit, each only where the image may depend on it."""
     fragments = wf.capture(scene)
-    pixel = np.repeat(np.arange(fragments.pixel_count), np.diff(fragments.offsets))
+    pixel = fragments.pixel
     seen = [
         np.isin(np.arange(fragments.pixel_count), pixel[fragments.object_id == index]).reshape(fragments.shape)
         for index in range(len(OBJECTS))

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 import warpfrag as wf
+from warpfrag.capture.render import over_background
 from warpfrag.scene.objects import Scene
 
 # Points that the pen went through, as shares of the image's width and height, and the breadth of the soft edge.
@@ -45,10 +46,8 @@ def make_target(scene: Scene) -> Target:
     rgba = fragments.rgba.copy()
     rgba[first[outside]] *= (1.0 - MODULATION * region.ravel()[covered][outside])[:, None].astype(np.float32)
     image = wf.composite(replace(fragments, rgba=rgba), 1.0, merge="none").reshape(*shape, 4)
-    background = np.asarray(scene.background, dtype=np.float32)
-    image = image[..., :3] + (1.0 - image[..., 3:]) * background[:3]
-    pixel = np.repeat(np.arange(covered.size), np.diff(fragments.offsets))
-    inner = np.bincount(pixel, np.isin(fragments.object_id, INNER), covered.size).reshape(shape) > 0
+    image = over_background(image, scene.background)[..., :3]
+    inner = np.bincount(fragments.pixel, np.isin(fragments.object_id, INNER), covered.size).reshape(shape) > 0
     covered = covered.reshape(shape)
     return Target(
         image=image,

@@ -121,7 +121,7 @@ def on_grid(scene: wf.Scene, samples: int) -> wf.Scene:
 def front_order(scene: wf.Scene) -> np.ndarray:
     """Return for two objects which is in front in each pixel: 1 the first, -1 the second, 0 where not both are."""
     fragments = wf.capture(scene).numpy()
-    pixel = np.repeat(np.arange(fragments.pixel_count), np.diff(fragments.offsets))
+    pixel = fragments.pixel
     first = np.full((2, fragments.pixel_count), np.inf)
     for index in (0, 1):
         members = fragments.object_id == index

@@ -19,6 +19,7 @@ import figures  # noqa: E402
 from comparison import Comparison, NoOpenGLError, compare, on_grid  # noqa: E402
 
 import warpfrag as wf  # noqa: E402
+from warpfrag.capture.render import over_background  # noqa: E402
 from warpfrag.fit import FitParameter, FitResult, Reference, Study  # noqa: E402
 from warpfrag.fit.losses import psnr  # noqa: E402
 from warpfrag.fit.summary import Figure, Summary, Table  # noqa: E402
@@ -28,7 +29,7 @@ HERE = Path(__file__).parent
 ANTIALIASING = HERE.parent / "antialiasing"
 sys.path.append(str(ANTIALIASING))
 
-from footprint import intersection_band, nearest_pairs, pixel_of  # noqa: E402
+from footprint import intersection_band, nearest_pairs  # noqa: E402
 
 RESULTS = Path("results") / "fit" / "opengl"
 SAMPLES = 8
@@ -138,9 +139,9 @@ def by_rule(scene: wf.Scene, factor: float) -> np.ndarray:
     """Return the image whose thickness is what the antialiasing study's rule says."""
     fragments = wf.capture(scene).numpy()
     pairs = nearest_pairs(scene, fragments)
-    thickness = np.where(pairs.distance <= REACH, factor * pairs.footprints()["|g₁ − g₂|"], 0.0)[pixel_of(fragments)]
+    thickness = np.where(pairs.distance <= REACH, factor * pairs.footprints()["|g₁ − g₂|"], 0.0)[fragments.pixel]
     image = wf.composite(replace(fragments, thickness=thickness.astype(np.float32)), 1.0, max_layers=scene.layers)
-    return image + (1.0 - image[..., 3:]) * np.asarray(scene.background, np.float32)
+    return over_background(image, scene.background)
 
 
 def summarise(cases: list[Case], factor: float) -> Summary:

@@ -78,7 +78,7 @@ class FrozenView(ViewProblem):
         """Return the image for parameter values; torch tensors get their gradient."""
         parameters = self.parameters(values)
         if isinstance(parameters["beta"], np.ndarray):
-            fragments = self.unit.scaled(parameters, self.study.variables)
+            fragments = self.unit.scaled(*self.unit.scales(parameters))
         else:
             import torch
 
@@ -269,7 +269,8 @@ def _descend(problem: Problem, meter: Meter) -> None:
     images, passes = meter.images, meter.passes
 
     def look(_: Progress) -> None:
-        meter.record(images + fit.evaluations, passes + fit.evaluations, fit.best_loss, fit.best)
+        course = fit.course
+        meter.record(images + course.evaluations, passes + course.evaluations, course.best_loss, course.best)
 
     method = {"adam": Adam, "lbfgs": LBFGS}[str(problem.study.method)]
     fit = method(problem, Session(problem.study, "", None, look, 0.0))

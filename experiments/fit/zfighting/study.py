@@ -115,7 +115,7 @@ def fit() -> dict[str, float]:
     study = load_study(HERE / "study.toml")
     result = wf.fit(study)
     fragments = wf.capture(study.scene, sort=False)
-    pixel = np.repeat(np.arange(fragments.pixel_count), np.diff(fragments.offsets))
+    pixel = fragments.pixel
     seen = np.bincount(pixel, weights=2.0**fragments.object_id, minlength=fragments.pixel_count)
     # Red and blue, without green before them.
     both = (seen == 3.0).reshape(fragments.shape)
