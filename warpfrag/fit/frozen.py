@@ -59,8 +59,10 @@ class UnitFragments:
 
     def scaled(self, rgba: np.ndarray, thickness: np.ndarray) -> Fragments:
         """Return the fragments for what `scales` gives."""
-        unit, factors = self.fragments, premultiplied(rgba)[self.objects]
-        return replace(unit, rgba=unit.rgba * factors, thickness=unit.thickness * thickness[self.objects])
+        unit = self.fragments
+        # Mostly it is thicknesses that are fitted.
+        colors = unit.rgba if (rgba == 1.0).all() else unit.rgba * premultiplied(rgba)[self.objects]
+        return replace(unit, rgba=colors, thickness=unit.thickness * thickness[self.objects])
 
 
 def premultiplied(rgba: np.ndarray) -> np.ndarray:

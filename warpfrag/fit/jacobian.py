@@ -12,7 +12,7 @@ few hundred bytes, and processes exchange no more.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,7 @@ from warpfrag.fit.losses import RobustLoss, pyramid
 from warpfrag.fit.parameters import placed
 from warpfrag.fit.problem import Problem, ViewProblem
 from warpfrag.fragments import Fragments
-from warpfrag.interop.launch import Span, launch
+from warpfrag.interop.launch import Span, launch, share, thread_count
 from warpfrag.scene.pose import CAMERA, pose_matrix
 
 wp.set_module_options({"enable_backward": False})
@@ -114,41 +114,40 @@ class ViewEvaluation:
         # Beta as one value per pixel, so that its gradient stays apart by pixel.
         beta = np.full(problem.scene.camera.shape, self.values.get("beta", problem.scene.beta), np.float32)
         moves = problem.moves and bool(keys)
-        self.rgba = wp.array(
-            self.fragments.rgba, device=device, requires_grad=moves or bool(keys & {"opacity", "color"})
-        )
-        self.depth = wp.array(self.fragments.depth, device=device, requires_grad=moves)
-        self.thickness = wp.array(self.fragments.thickness, device=device, requires_grad=moves or "thickness" in keys)
-        self.beta = wp.array(beta, device=device, requires_grad="beta" in keys)
-        offsets = wp.array(self.fragments.offsets, device=device)
+
+        def shared(array: np.ndarray, differentiable: bool) -> wp.array:
+            return wp.array(array, device=device, copy=False, requires_grad=differentiable)
+
+        self.rgba = shared(self.fragments.rgba, moves or bool(keys & {"opacity", "color"}))
+        self.depth = shared(self.fragments.depth, moves)
+        self.thickness = shared(self.fragments.thickness, moves or "thickness" in keys)
+        self.beta = shared(beta, "beta" in keys)
+        offsets = shared(self.fragments.offsets, False)
         self.tape = wp.Tape()
         with self.tape:
-            shared = Fragments(self.rgba, self.depth, self.thickness, offsets, self.fragments.shape)
-            self.raw = problem.composite(shared, self.beta)
+            fragments = Fragments(self.rgba, self.depth, self.thickness, offsets, self.fragments.shape)
+            self.raw = problem.composite(fragments, self.beta)
         self.residual = problem.residual(problem.over_background(self.raw.numpy())).astype(np.float64)
         levels = [loss.rho(level).mean() for level in pyramid(self.residual, scales)]
         self.cost = float(np.mean(levels))
 
-    @property
-    def covered(self) -> np.ndarray:
-        """Whether any object covers a pixel, (H, W)."""
-        return (np.diff(self.fragments.offsets) > 0).reshape(self.fragments.shape)
-
     def blocks(self) -> Iterator[tuple[float, np.ndarray]]:
-        """Yield rows [f J] and the weight of their squares in the view's mean."""
-        covered = self.covered
+        """Yield rows [f J] and the weight of their squares in the view's mean; without those whose J is 0."""
+        height, width = self.fragments.shape
         for channel in range(self.problem.channels):
-            jacobian = self.channel(channel).reshape(*covered.shape, -1)
-            rows = np.concatenate([self.residual[..., channel, None], jacobian], axis=-1)
-            levels = [np.concatenate([rows, covered[..., None]], axis=-1)]
+            if self._is_fixed(channel):
+                continue
+            rows = self._rows(channel).reshape(height, width, -1)
+            covered = self.covered[..., None]
             if self.scales > 1:
-                levels = list(pyramid(levels[0], self.scales))
-            for level in levels:
+                covered = covered.astype(np.float64)
+            levels = list(zip(pyramid(rows, self.scales), pyramid(covered, self.scales), strict=True))
+            for level, part in levels:
                 # Pixels that no fragment covers do not depend on anything.
-                inside = level[level[..., -1] > 0.0][:, :-1]
-                weight = np.sqrt(self.loss.weight(inside[:, 0]))
-                count = level.shape[0] * level.shape[1] * self.problem.channels
-                yield 1.0 / (count * len(levels)), inside * weight[:, None]
+                inside = level[part[..., 0] > 0.0]
+                if not np.isinf(self.loss.delta):
+                    inside *= np.sqrt(self.loss.weight(inside[:, :1]))
+                yield 1.0 / (level.shape[0] * level.shape[1] * self.problem.channels * len(levels)), inside
 
     def _unit(self) -> tuple[Coverage, UnitFragments]:
         problem = self.problem
@@ -160,27 +159,48 @@ class ViewEvaluation:
 
     def channel(self, channel: int) -> np.ndarray:
         """Return the derivatives of one channel of the image in all coordinates, (pixels, coordinates)."""
-        background, count = self.problem.scene.background, int(self.fragments.offsets.size) - 1
-        sums = np.zeros((count, sum(variable.start.size for variable in self.variables)))
-        # Opacity does not depend on beta, thickness, colour or depth: no pass where it cannot change. Texture and
-        # opacity per vertex move with their surface.
-        fixed = channel == 3 and (
-            background[3] == 1.0 or not (self.problem.moves or any(v.key == "opacity" for v in self.variables))
-        )
-        if fixed or not self.fragments.count:
-            return sums
+        return self._rows(channel)[:, 1:].copy()
+
+    @cached_property
+    def _memory(self) -> np.ndarray:
+        """Room for the rows of a channel: fresh memory for each would take as long as filling it."""
+        return np.empty((self.residual[..., 0].size, 1 + sum(variable.start.size for variable in self.variables)))
+
+    @cached_property
+    def covered(self) -> np.ndarray:
+        """Whether any object covers a pixel, (H, W)."""
+        return (np.diff(self.fragments.offsets) > 0).reshape(self.fragments.shape)
+
+    def _is_fixed(self, channel: int) -> bool:
+        """Whether a channel cannot change.
+
+        Opacity does not depend on beta, thickness, colour or depth; texture and opacity per vertex move with their
+        surface.
+        """
+        opaque = self.problem.scene.background[3] == 1.0
+        moves = self.problem.moves or any(variable.key == "opacity" for variable in self.variables)
+        return not self.fragments.count or (channel == 3 and (opaque or not moves))
+
+    def _rows(self, channel: int) -> np.ndarray:
+        """Return the rows [f J] of one channel, (pixels, 1 + coordinates) float64, until the next are asked for."""
+        rows = self._memory
+        rows[...] = 0.0
+        rows[:, 0] = self.residual[..., channel].reshape(-1)
+        if self._is_fixed(channel):
+            return rows
         seed = np.zeros(self.raw.shape, np.float32)
         seed[..., channel] = 1.0
-        seed[..., 3] -= background[channel]
+        seed[..., 3] -= self.problem.scene.background[channel]
         self.tape.zero()
         self.tape.backward(grads={self.raw: wp.array(seed, device=self.raw.device)})
+        sums = rows[:, 1:]
         self._sum_objects(sums)
         for variable, place in placed(self.variables):
             if variable.key == "beta":
                 sums[:, place.start] = self.beta.grad.numpy().reshape(-1)
         if self.problem.moves:
             self._sum_motions(sums)
-        return sums
+        return rows
 
     @cached_property
     def _columns(self) -> np.ndarray:
@@ -287,13 +307,14 @@ class Evaluation:
 
 def _triangle(parts: Sequence[np.ndarray]) -> np.ndarray:
     """Return the triangle R of a QR decomposition of rows, square."""
-    rows = np.concatenate(parts)
+    rows = np.concatenate(parts) if len(parts) > 1 else parts[0]
     columns = rows.shape[1]
     block = max(QR_ROWS, 2 * columns)
     whole = len(rows) // block * block
     if whole > block:
-        blocks = np.asarray(np.linalg.qr(rows[:whole].reshape(-1, block, columns), mode="r"))
-        rows = np.concatenate([blocks.reshape(-1, columns), rows[whole:]])
+        blocks = np.array_split(rows[:whole].reshape(-1, block, columns), thread_count())
+        triangles = share(partial(np.linalg.qr, mode="r"), blocks)
+        rows = np.concatenate([*(triangle.reshape(-1, columns) for triangle in triangles), rows[whole:]])
     # With at least as many rows as columns it is square.
     padded = np.concatenate([rows, np.zeros((columns, columns))]) if len(rows) < columns else rows
     return np.asarray(np.linalg.qr(padded, mode="r"))

@@ -11,7 +11,7 @@ the same address, results have the same bits for any number of threads.
 """
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from typing import Any
@@ -95,6 +95,13 @@ def launch(kernel: wp.Kernel, size: int, inputs: Sequence[Any], device: wp.Devic
     finally:
         for other in others:
             other.result()
+
+
+def share(work: Callable[[Any], Any], parts: Sequence[Any]) -> list[Any]:
+    """Return what a function gives for each part, over the pool of threads; it should let go of the GIL."""
+    if len(parts) < 2 or thread_count() == 1:
+        return [work(part) for part in parts]
+    return list(_pool(thread_count() - 1).map(work, parts))
 
 
 def _span(begin: int, end: int, stride: int, worker: int) -> Span:

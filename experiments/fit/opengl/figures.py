@@ -39,7 +39,7 @@ def comparison(compared: dict[str, Comparison], curves: dict[str, np.ndarray]) -
                 row, column = np.nonzero(mask & (pair.differing > 0))
                 area = 3.0 + 7.0 * residual[row, column]
                 axis.scatter(column, row, s=area, lw=0, color=color, label=f"{len(row)} {words}")
-            axis.set_title(f"pixels that differ (area: by how much),\nvertices {name}")
+            axis.set_title(f"pixels that differ,\nvertices {name}")
             legend = axis.legend(fontsize=7.5, frameon=False, loc="upper center", bbox_to_anchor=(0.5, 0.02))
             for handle in legend.legend_handles:
                 handle.set_sizes([16.0])
