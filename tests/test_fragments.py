@@ -142,6 +142,14 @@ def test_from_lists_checks_its_tuples(tuples):
         Fragments.from_lists([tuples * 3, []], (1, 2))
 
 
+def test_pixel_of_each_fragment():
+    """Whatever the kind of arrays, NumPy; pixels without fragments are passed over."""
+    one = (0.1, 0.2, 0.3, 0.5, 1.0, 0.0)
+    fragments = Fragments.from_lists([[one], [], [one, one]], shape=(1, 3), dtype=np.float32)
+    for kind in (fragments, fragments.torch()):
+        assert kind.pixel.tolist() == [0, 2, 2]
+
+
 def test_conversions_keep_everything(device):
     """NumPy to torch to Warp and back, optional arrays included, or left out."""
     ids = {"object_id": np.array([0, 1, 1], np.int32), "primitive_id": np.array([5, 6, 7], np.int32)}

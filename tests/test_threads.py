@@ -13,7 +13,7 @@ from fragment_arrays import fragments_of
 from pixels import Pixels, random_pixels
 
 import warpfrag as wf
-from warpfrag.interop.launch import SMALLEST_PIECE, Span, launch, thread_count, worker_count
+from warpfrag.interop.launch import SMALLEST_PIECE, Span, launch, share, thread_count, worker_count
 
 THREADS = (1, 2, 3, 8)
 PIXEL_COUNT = 40 * SMALLEST_PIECE + 17
@@ -145,3 +145,13 @@ print("child", os.waitpid(child, 0)[1])
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert done.stdout.endswith("child 0\n"), done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("threads", [1, 2, 8])
+def test_shared_work_comes_back_in_order(monkeypatch, threads):
+    """Whoever did a part, its result stands in its place; an error in any part is raised."""
+    monkeypatch.setenv("WARPFRAG_THREADS", str(threads))
+    assert share(lambda part: 2 * part, list(range(9))) == list(range(0, 18, 2))
+    assert share(str, []) == []
+    with pytest.raises(ZeroDivisionError):
+        share(lambda part: 1 // (part - 7), list(range(9)))

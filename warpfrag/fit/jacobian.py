@@ -134,10 +134,12 @@ class ViewEvaluation:
     def blocks(self) -> Iterator[tuple[float, np.ndarray]]:
         """Yield rows [f J] and the weight of their squares in the view's mean; without those whose J is 0."""
         height, width = self.fragments.shape
+        # Once for all channels: fresh memory for each would take as long as filling it.
+        memory = self._memory()
         for channel in range(self.problem.channels):
             if self._is_fixed(channel):
                 continue
-            rows = self._rows(channel).reshape(height, width, -1)
+            rows = self._rows(channel, memory).reshape(height, width, -1)
             covered = self.covered[..., None]
             if self.scales > 1:
                 covered = covered.astype(np.float64)
@@ -159,11 +161,10 @@ class ViewEvaluation:
 
     def channel(self, channel: int) -> np.ndarray:
         """Return the derivatives of one channel of the image in all coordinates, (pixels, coordinates)."""
-        return self._rows(channel)[:, 1:].copy()
+        return self._rows(channel, self._memory())[:, 1:]
 
-    @cached_property
     def _memory(self) -> np.ndarray:
-        """Room for the rows of a channel: fresh memory for each would take as long as filling it."""
+        """Return room for the rows of a channel."""
         return np.empty((self.residual[..., 0].size, 1 + sum(variable.start.size for variable in self.variables)))
 
     @cached_property
@@ -181,9 +182,8 @@ class ViewEvaluation:
         moves = self.problem.moves or any(variable.key == "opacity" for variable in self.variables)
         return not self.fragments.count or (channel == 3 and (opaque or not moves))
 
-    def _rows(self, channel: int) -> np.ndarray:
-        """Return the rows [f J] of one channel, (pixels, 1 + coordinates) float64, until the next are asked for."""
-        rows = self._memory
+    def _rows(self, channel: int, rows: np.ndarray) -> np.ndarray:
+        """Fill the rows [f J] of one channel, (pixels, 1 + coordinates) float64, and return them."""
         rows[...] = 0.0
         rows[:, 0] = self.residual[..., channel].reshape(-1)
         if self._is_fixed(channel):

@@ -73,7 +73,7 @@ def fit(
             remove_partial(output)
     first = is_first_process()
     with progress_bar(study.name) if progress is True and first else nullcontext(progress or None) as report:
-        result = _run(study, resume, output, report if callable(report) else None)
+        result = _run(study, resume, output, report if callable(report) and first else None)
     if output is not None and first:
         result.save(output)
     return result

@@ -101,7 +101,8 @@ def share(work: Callable[[Any], Any], parts: Sequence[Any]) -> list[Any]:
     """Return what a function gives for each part, over the pool of threads; it should let go of the GIL."""
     if len(parts) < 2 or thread_count() == 1:
         return [work(part) for part in parts]
-    return list(_pool(thread_count() - 1).map(work, parts))
+    others = [_pool(thread_count() - 1).submit(work, part) for part in parts[1:]]
+    return [work(parts[0]), *(other.result() for other in others)]
 
 
 def _span(begin: int, end: int, stride: int, worker: int) -> Span:
