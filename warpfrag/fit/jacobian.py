@@ -134,22 +134,21 @@ class ViewEvaluation:
     def blocks(self) -> Iterator[tuple[float, np.ndarray]]:
         """Yield rows [f J] and the weight of their squares in the view's mean; without those whose J is 0."""
         height, width = self.fragments.shape
+        covered = self.covered[..., None]
+        # Halving needs numbers.
+        shares = list(pyramid(covered.astype(np.float64) if self.scales > 1 else covered, self.scales))
         # Once for all channels: fresh memory for each would take as long as filling it.
         memory = self._memory()
         for channel in range(self.problem.channels):
             if self._is_fixed(channel):
                 continue
             rows = self._rows(channel, memory).reshape(height, width, -1)
-            covered = self.covered[..., None]
-            if self.scales > 1:
-                covered = covered.astype(np.float64)
-            levels = list(zip(pyramid(rows, self.scales), pyramid(covered, self.scales), strict=True))
-            for level, part in levels:
+            for level, part in zip(pyramid(rows, self.scales), shares, strict=True):
                 # Pixels that no fragment covers do not depend on anything.
                 inside = level[part[..., 0] > 0.0]
                 if not np.isinf(self.loss.delta):
                     inside *= np.sqrt(self.loss.weight(inside[:, :1]))
-                yield 1.0 / (level.shape[0] * level.shape[1] * self.problem.channels * len(levels)), inside
+                yield 1.0 / (level.shape[0] * level.shape[1] * self.problem.channels * len(shares)), inside
 
     def _unit(self) -> tuple[Coverage, UnitFragments]:
         problem = self.problem
@@ -286,7 +285,7 @@ class Evaluation:
         total = problem.processes.sum(np.array([sum(view.cost for view in self.views)]))
         self.cost = float(total[0]) / len(problem.views)
 
-    def covered(self) -> tuple[int, float]:
+    def covered_residuals(self) -> tuple[int, float]:
         """Return the number of residuals in pixels that any object covers, and the sum of their squares."""
         mine = np.zeros(2)
         for view in self.views:

@@ -162,7 +162,7 @@ def _certainty(
     # Whatever the loss: how far images may differ by noise is a matter of squares, at the scale that has the noise.
     evaluation = Evaluation(problem, RobustLoss.named("l2", study.delta), coordinates, scales=1)
     residual_count = sum(view.reference.size for view in problem.views)
-    certainty = assess(evaluation.compress(), study.variables, residual_count, *evaluation.covered())
+    certainty = assess(evaluation.compress(), study.variables, residual_count, *evaluation.covered_residuals())
     errors = {}
     for variable, place in placed(study.variables):
         error = certainty.standard_errors[place].reshape(variable.start.shape)

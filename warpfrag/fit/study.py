@@ -253,15 +253,17 @@ class Study:
             raise StudyError(f"batch: found {self.batch}, expected up to {len(self.fitted_views)}, the views to fit")
 
     def _check_held_out(self) -> None:
-        if len(self.fitted_views) == len(self.all_views):
+        held_out = [view for view in self.all_views if view.held_out]
+        if not held_out:
             return
-        count, reference = len(self.fitted_views), self.reference
-        for name, value in (reference.true or {} if reference is not None else {}).items():
-            if is_stacked(name, value, count):
-                raise StudyError(
-                    f"reference.true.{name}: found one value per view with views that are held out, for which there is "
-                    "none; expected one that all views share"
-                )
+        for view in held_out:
+            assert view.reference is not None
+            for name, value in (view.reference.true or {}).items():
+                if is_stacked(name, value, len(self.fitted_views)):
+                    raise StudyError(
+                        f"reference.true.{name}: found one value per view with views that are held out, for which "
+                        "there is none; expected one that all views share"
+                    )
         for variable in self.variables:
             if variable.per in ("pixel", "view"):
                 raise StudyError(

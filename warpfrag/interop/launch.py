@@ -89,20 +89,17 @@ def launch(kernel: wp.Kernel, size: int, inputs: Sequence[Any], device: wp.Devic
             span = _span(begin, min(begin + piece, size), 1, worker)
             wp.launch(kernel, dim=1, inputs=[span, *inputs], device=device, record_tape=False)
 
-    others = [_pool(threads - 1).submit(work, worker) for worker in range(1, threads)]
-    try:
-        work(0)
-    finally:
-        for other in others:
-            other.result()
+    share(work, range(threads))
 
 
 def share(work: Callable[[Any], Any], parts: Sequence[Any]) -> list[Any]:
-    """Return what a function gives for each part, over the pool of threads; it should let go of the GIL."""
-    if len(parts) < 2 or thread_count() == 1:
-        return [work(part) for part in parts]
-    others = [_pool(thread_count() - 1).submit(work, part) for part in parts[1:]]
-    return [work(parts[0]), *(other.result() for other in others)]
+    """Return what a function gives for each part, a thread for each; it should let go of the GIL."""
+    others = [_pool(len(parts) - 1).submit(work, part) for part in parts[1:]]
+    try:
+        first = [work(part) for part in parts[:1]]
+    finally:
+        rest = [other.result() for other in others]
+    return first + rest
 
 
 def _span(begin: int, end: int, stride: int, worker: int) -> Span:

@@ -45,9 +45,10 @@ def main() -> None:
         study = replace(study, scene=scene, reference=Reference(image=make_target(scene).image))
     target = make_target(scene)
     images, found = fit_all(study)
-    levels = {name: decibels(image, target)["all"] for name, image in images.items()}
+    scores = {name: decibels(image, target) for name, image in images.items()}
+    levels = {name: score["all"] for name, score in scores.items()}
     draw(target, shown(images), levels, maps_of(found, scene), HERE / "figures")
-    report(target, scene, images, found)
+    report(target, scene, scores, found)
 
 
 def fit_all(study: Study) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
@@ -105,9 +106,10 @@ def decibels(image: np.ndarray, target: Target) -> dict[str, float]:
     return {name: psnr(image, target.image, area) for name, area in target.areas.items()}
 
 
-def report(target: Target, scene: wf.Scene, images: dict[str, np.ndarray], found: dict[str, dict[str, Any]]) -> None:
+def report(
+    target: Target, scene: wf.Scene, scores: dict[str, dict[str, float]], found: dict[str, dict[str, Any]]
+) -> None:
     """Write README.md, numbers.json and summary.json."""
-    scores = {name: decibels(image, target) for name, image in images.items()}
     endless = wf.render(scene, parameters={"outer.thickness": ENDLESS, "beta": 1.0})
     limit = decibels(endless, target)["back wall"]
     by_object, best = scores["one per object"], scores["a map per object, and of β"]

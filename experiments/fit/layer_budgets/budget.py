@@ -68,7 +68,7 @@ class Case:
     @cached_property
     def owner(self) -> Any:
         """The pixel of each fragment, the same in both orders, (F,)."""
-        return torch.as_tensor(np.repeat(np.arange(len(self.counts)), self.counts))
+        return torch.as_tensor(self.fragments[True].pixel)
 
     @cached_property
     def extent(self) -> np.ndarray:

@@ -173,7 +173,9 @@ class Setting:
         """Return the standard errors of all parameters, relative to their values, for noise of 1 in the image."""
         problem = self.problem(self.study(values, self.images(values)))
         evaluation = Evaluation(problem, RobustLoss.named("l2", 1.0), problem.start())
-        certainty = assess(evaluation.compress(), problem.study.variables, self.residual_count, *evaluation.covered())
+        certainty = assess(
+            evaluation.compress(), problem.study.variables, self.residual_count, *evaluation.covered_residuals()
+        )
         # The image is its own reference: all noise is what `assess` assumes. Those of thicknesses are relative already.
         return {
             name: float(error) / SMALLEST_NOISE / (values[name] if name == "beta" else 1.0)
