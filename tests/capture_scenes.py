@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from warpfrag.scene import Camera, Scene, SceneObject
+from warpfrag.scene.camera import Camera
+from warpfrag.scene.scene import Scene, SceneObject
 
 AHEAD = {"eye": (0.0, 0.0, 0.0), "target": (0.0, 0.0, 1.0), "up": (0.0, -1.0, 0.0)}
 """A camera whose space is world space."""

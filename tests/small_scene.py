@@ -3,12 +3,31 @@
 import numpy as np
 
 from warpfrag.scene.camera import Camera
-from warpfrag.scene.objects import Scene, SceneObject
-from warpfrag.scene.primitives import sphere
+from warpfrag.scene.scene import Scene, SceneObject
+from warpfrag.shapes.primitives import sphere
 
 COLORS = ((0.9, 0.1, 0.1), (0.1, 0.8, 0.2), (0.1, 0.2, 0.9))
 THICKNESSES = (0.3, 0.4, 0.25)
 NAMES = ("red", "green", "blue")
+# A scene file of a ball and a disc, of which studies and commands are tried.
+SCENE = """
+beta = 0.5
+background = [1, 1, 1]
+[camera]
+eye = [0, 0, 3]
+target = [0, 0, 0]
+fov = 40
+size = [24, 16]
+[[object]]
+name = "ball"
+primitive = "sphere"
+segments = 12
+thickness = 0.2
+[[object]]
+name = "disc"
+primitive = "plane"
+thickness = "2P"
+"""
 
 
 def spheres(count: int = 3, *, size: tuple[int, int] = (40, 36), apart: float = 0.4, beta: float = 0.5) -> Scene:

@@ -7,14 +7,14 @@ import pytest
 import torch
 from capture_scenes import orthographic, perspective, quad, scene, soup, surface
 
+from warpfrag import render as render_module
 from warpfrag.capture import memory
-from warpfrag.capture import render as render_module
 from warpfrag.capture.capture import capture
-from warpfrag.capture.precision import z_resolution
-from warpfrag.capture.render import render
 from warpfrag.composite import composite
-from warpfrag.scene.files import load_scene
-from warpfrag.scene.primitives import sphere
+from warpfrag.files.scene_file import load_scene
+from warpfrag.render import render
+from warpfrag.scene.depth_resolution import z_resolution
+from warpfrag.shapes.primitives import sphere
 
 SCENES = Path(__file__).parents[1] / "scenes"
 

@@ -12,17 +12,20 @@ scene from an image. Arrays may be torch tensors, Warp arrays or NumPy arrays: w
 """
 
 from warpfrag import baselines
-from warpfrag.absorbance import Absorbance, absorbance
+from warpfrag.analysis.absorbance import Absorbance, absorbance
+from warpfrag.capture.bounded import Culling, capture_kbuffer, count_culled
 from warpfrag.capture.capture import capture
-from warpfrag.capture.kbuffer import Culling, capture_kbuffer, count_culled
-from warpfrag.capture.precision import z_resolution
-from warpfrag.capture.render import render
 from warpfrag.composite import composite
+from warpfrag.errors import SceneError
+from warpfrag.files.scene_file import load_scene
 from warpfrag.fit import FitError, FitParameter, FitResult, Reference, Study, StudyError, View, fit, load_study
 from warpfrag.fragments import Fragments, Layers
-from warpfrag.resolve.kbuffer import kbuffer
-from warpfrag.resolve.smooth import resolve
-from warpfrag.scene import Camera, Scene, SceneError, SceneObject, load_scene
+from warpfrag.render import render
+from warpfrag.resolve.resolve import resolve
+from warpfrag.scene.camera import Camera
+from warpfrag.scene.depth_resolution import z_resolution
+from warpfrag.scene.scene import Scene, SceneObject
+from warpfrag.storage.kbuffer import kbuffer
 
 __version__ = "0.1.0"
 

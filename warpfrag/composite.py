@@ -16,9 +16,9 @@ from typing import Any
 
 import warp as wp
 
+from warpfrag.arrays.launch import Span, launch
+from warpfrag.arrays.operator import Operator, apply, vectors
 from warpfrag.fragments import Fragments, Layers
-from warpfrag.interop.launch import Span, launch
-from warpfrag.interop.operator import Operator, apply, vectors
 from warpfrag.resolve.arguments import (
     FRAGMENT_DIFFERENTIABLE,
     FRAGMENT_TENSORS,
@@ -33,7 +33,7 @@ from warpfrag.resolve.arguments import (
     check_options,
     fragment_inputs,
 )
-from warpfrag.resolve.exact import COMPOSITE_EXACT, apply_exact
+from warpfrag.resolve.exact.exact import COMPOSITE_EXACT, apply_exact
 from warpfrag.resolve.walk import (
     STEP_START,
     choose_step,

@@ -17,8 +17,8 @@ from warpfrag.fit import FitParameter, Reference, Study, fit  # noqa: E402
 from warpfrag.fit.jacobian import Evaluation  # noqa: E402
 from warpfrag.fit.problem import Problem  # noqa: E402
 from warpfrag.scene.camera import Camera  # noqa: E402
-from warpfrag.scene.objects import Scene, SceneObject  # noqa: E402
-from warpfrag.scene.primitives import sphere  # noqa: E402
+from warpfrag.scene.scene import Scene, SceneObject  # noqa: E402
+from warpfrag.shapes.primitives import sphere  # noqa: E402
 
 
 def nested_spheres(count: int, size: int) -> Scene:

@@ -16,7 +16,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
-from warpfrag.saving import replacing
+from warpfrag.files.saving import replacing
 
 HERE = Path(__file__).parent
 RESULTS = Path("results") / "exact"

@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from PIL import Image
 
-from warpfrag.saving import replacing
+from warpfrag.files.saving import replacing
 
 HERE = Path(__file__).parent
 RESULTS = Path("results") / "oit"

@@ -6,9 +6,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from warpfrag.scene.mesh import Mesh, smooth_normals, split_faces
-from warpfrag.scene.points import PointSet
-from warpfrag.scene.primitives import cube, sphere
+from warpfrag.shapes.mesh import Mesh, smooth_normals, split_faces
+from warpfrag.shapes.primitives import cube, sphere
+from warpfrag.shapes.surfels import PointSet
 
 TURN = 2.0 * np.pi
 

@@ -27,10 +27,10 @@ from methods import BETA, COMPARED, OTHERS, SLOTS, over_background  # noqa: E402
 
 import warpfrag as wf  # noqa: E402
 from warpfrag.capture.capture import place_surfaces  # noqa: E402
-from warpfrag.capture.raster import count_fragments, scan_counts  # noqa: E402
-from warpfrag.capture.ray import Window  # noqa: E402
-from warpfrag.saving import replacing  # noqa: E402
-from warpfrag.scene import assemble  # noqa: E402
+from warpfrag.files.saving import replacing  # noqa: E402
+from warpfrag.raster.ray import Window  # noqa: E402
+from warpfrag.raster.triangles import count_fragments, scan_counts  # noqa: E402
+from warpfrag.scene.assemble import assemble  # noqa: E402
 
 RESULTS = Path("results") / "oit"
 # Multiples of P(z) and numbers of slots that errors are measured at, beside the paper's 100 and 8.

@@ -9,9 +9,9 @@ import numpy as np
 import shapes
 
 import warpfrag as wf
-from warpfrag.scene.loading import load_mesh, warp_asset
-from warpfrag.scene.mesh import Mesh, lambert, smooth_normals
-from warpfrag.scene.points import POINT_SUFFIXES, PointSet, load_points, surfels
+from warpfrag.files.meshes import load_mesh, warp_asset
+from warpfrag.shapes.mesh import Mesh, lambert, smooth_normals
+from warpfrag.shapes.surfels import POINT_SUFFIXES, PointSet, load_points, surfels
 
 SCENES = Path(__file__).parents[2] / "scenes"
 WHITE = (1.0, 1.0, 1.0, 1.0)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from warpfrag.saving import replacing
+from warpfrag.files.saving import replacing
 
 BEGIN, END = "<!-- results: begin (written by figures.py) -->", "<!-- results: end -->"
 

@@ -17,10 +17,10 @@ from typing import Any, Literal, get_args
 
 import warp as wp
 
+from warpfrag.arrays.launch import Span
 from warpfrag.baselines.inputs import check_whole, exact_image
 from warpfrag.baselines.stream import stream, stream_operator
 from warpfrag.fragments import Fragments
-from warpfrag.interop.launch import Span
 from warpfrag.resolve.arguments import check_choice
 
 wp.set_module_options({"enable_backward": False})

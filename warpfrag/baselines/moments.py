@@ -26,7 +26,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from warpfrag.absorbance import fragments_of_pixel
+from warpfrag.analysis.absorbance import fragments_of_pixel
 from warpfrag.baselines.inputs import array_module, exact_image, owners, range_of_depths, ratio, sum_pixels
 from warpfrag.fragments import Fragments
 

@@ -15,10 +15,10 @@ from typing import Any
 
 import warp as wp
 
+from warpfrag.arrays.launch import Span
 from warpfrag.baselines.inputs import check_whole, exact_image
 from warpfrag.baselines.stream import stream, stream_operator
 from warpfrag.fragments import Fragments
-from warpfrag.interop.launch import Span
 
 wp.set_module_options({"enable_backward": False})
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import warp as wp
 
+from warpfrag.arrays.launch import launch, worker_count
+from warpfrag.arrays.operator import Operator, apply, kind_of, vectors
 from warpfrag.fragments import Fragments
-from warpfrag.interop.launch import launch, worker_count
-from warpfrag.interop.operator import Operator, apply, kind_of, vectors
 from warpfrag.resolve.arguments import as_int32
 
 

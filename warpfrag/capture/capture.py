@@ -8,8 +8,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warpfrag.arrays.operator import apply, kind_of
 from warpfrag.capture.memory import allowed_memory, fixed_bytes, fragment_bytes, refuse
-from warpfrag.capture.raster import (
+from warpfrag.capture.shade_adjoint import SHADE, SHADE_COVERED
+from warpfrag.fragments import Fragments
+from warpfrag.raster.ray import Window
+from warpfrag.raster.triangles import (
     Triangles,
     count_fragments,
     prepare_triangles,
@@ -17,14 +21,10 @@ from warpfrag.capture.raster import (
     sort_fragments,
     store_fragments,
 )
-from warpfrag.capture.ray import Window
-from warpfrag.capture.shade_adjoint import SHADE, SHADE_COVERED
-from warpfrag.fragments import Fragments
-from warpfrag.interop.operator import apply, kind_of
+from warpfrag.scene.assemble import Geometry, assemble
 from warpfrag.scene.camera import Camera
-from warpfrag.scene.geometry import Geometry, assemble
-from warpfrag.scene.objects import Scene
 from warpfrag.scene.pose import move_camera
+from warpfrag.scene.scene import Scene
 
 
 @dataclass(frozen=True)

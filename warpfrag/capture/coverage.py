@@ -17,6 +17,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warpfrag.arrays.launch import Span, launch
+from warpfrag.arrays.operator import dtype_name, kind_of, vectors
 from warpfrag.capture.capture import (
     Surfaces,
     check_scene,
@@ -27,14 +29,12 @@ from warpfrag.capture.capture import (
     to_warp,
 )
 from warpfrag.capture.fragment_adjoint import fragment_adjoint, load_triangle
-from warpfrag.capture.ray import Rays, Window, centre_x, centre_y
 from warpfrag.capture.shade import present
 from warpfrag.fragments import Fragments
-from warpfrag.interop.launch import Span, launch
-from warpfrag.interop.operator import dtype_name, kind_of, vectors
+from warpfrag.raster.ray import Rays, Window, centre_x, centre_y
+from warpfrag.scene.assemble import assemble
 from warpfrag.scene.camera import Camera
-from warpfrag.scene.geometry import assemble
-from warpfrag.scene.objects import Scene
+from warpfrag.scene.scene import Scene
 
 wp.set_module_options({"enable_backward": False})
 

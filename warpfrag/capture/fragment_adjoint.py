@@ -9,10 +9,10 @@ from typing import Any
 
 import warp as wp
 
-from warpfrag.capture.precision import DEPTH_STEP, depth_resolution_slope
-from warpfrag.capture.ray import ONE, Rays, edge_functions, load_point, seen_from, stretch
 from warpfrag.capture.shade import OBJECT_IN_P, OBJECT_MAP, hit_weights, thickness_scale
 from warpfrag.capture.texture import Lookup, load_rgba, load_uv, look_up, mix3, texel_between, texture_place
+from warpfrag.raster.ray import ONE, Rays, edge_functions, load_point, seen_from, stretch
+from warpfrag.scene.depth_resolution import DEPTH_STEP, depth_resolution_slope
 
 wp.set_module_options({"enable_backward": False})
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
-from warpfrag.capture.raster import Triangles
+from warpfrag.raster.triangles import Triangles
 
 # Triangle, object and primitive of a fragment [bytes]; then colour and opacity, depth, z-thickness: numbers.
 FRAGMENT_INDICES = 12

@@ -16,8 +16,10 @@ from typing import Any
 
 import warp as wp
 
-from warpfrag.capture.precision import DEPTH_STEP, depth_resolution
-from warpfrag.capture.ray import (
+from warpfrag.arrays.launch import Span, launch
+from warpfrag.arrays.operator import vectors
+from warpfrag.capture.texture import load_rgba, load_uv, look_up, mix3, texel_between
+from warpfrag.raster.ray import (
     ONE,
     ZERO,
     Rays,
@@ -30,9 +32,7 @@ from warpfrag.capture.ray import (
     seen_from,
     stretch,
 )
-from warpfrag.capture.texture import load_rgba, load_uv, look_up, mix3, texel_between
-from warpfrag.interop.launch import Span, launch
-from warpfrag.interop.operator import vectors
+from warpfrag.scene.depth_resolution import DEPTH_STEP, depth_resolution
 
 wp.set_module_options({"enable_backward": False})
 

@@ -16,20 +16,9 @@ from typing import Any
 
 import warp as wp
 
+from warpfrag.arrays.launch import Span, launch
+from warpfrag.arrays.operator import Operator, vectors
 from warpfrag.capture.fragment_adjoint import Corners, fragment_adjoint, load_triangle
-from warpfrag.capture.raster import prepare_triangles
-from warpfrag.capture.ray import (
-    ZERO,
-    Rays,
-    Window,
-    centre_x,
-    centre_y,
-    columns_of_row,
-    hit_depth,
-    is_wide,
-    load_point,
-    stretch,
-)
 from warpfrag.capture.shade import (
     OBJECT_IN_P,
     OBJECT_MAP,
@@ -43,9 +32,20 @@ from warpfrag.capture.shade import (
     shade_output_like,
     thickness_scale,
 )
-from warpfrag.capture.strips import cut_strips, gather_corners, rows_of_strip
-from warpfrag.interop.launch import Span, launch
-from warpfrag.interop.operator import Operator, vectors
+from warpfrag.raster.ray import (
+    ZERO,
+    Rays,
+    Window,
+    centre_x,
+    centre_y,
+    columns_of_row,
+    hit_depth,
+    is_wide,
+    load_point,
+    stretch,
+)
+from warpfrag.raster.strips import cut_strips, gather_corners, rows_of_strip
+from warpfrag.raster.triangles import prepare_triangles
 
 wp.set_module_options({"enable_backward": False})
 

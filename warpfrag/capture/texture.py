@@ -4,7 +4,7 @@ from typing import Any
 
 import warp as wp
 
-from warpfrag.capture.ray import ONE
+from warpfrag.raster.ray import ONE
 
 wp.set_module_options({"enable_backward": False})
 

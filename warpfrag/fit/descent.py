@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 
 from warpfrag.extras import need
+from warpfrag.fit.certainty import Outcome
 from warpfrag.fit.maps import Smoothness, coarsen, level_of, refine
-from warpfrag.fit.outcome import Outcome
 from warpfrag.fit.parameters import placed
 from warpfrag.fit.problem import Problem
 from warpfrag.fit.session import FitError, Session, check_finite

@@ -18,13 +18,13 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warpfrag.arrays.launch import Span, launch, share, thread_count
 from warpfrag.capture.coverage import Coverage
-from warpfrag.fit.frozen import UnitFragments, premultiplied
 from warpfrag.fit.losses import RobustLoss, pyramid
 from warpfrag.fit.parameters import placed
 from warpfrag.fit.problem import Problem, ViewProblem
+from warpfrag.fit.scaled_fragments import UnitFragments, premultiplied
 from warpfrag.fragments import Fragments
-from warpfrag.interop.launch import Span, launch, share, thread_count
 from warpfrag.scene.pose import CAMERA, pose_matrix
 
 wp.set_module_options({"enable_backward": False})

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from warpfrag.extras import need
+from warpfrag.fit.certainty import Outcome
 from warpfrag.fit.jacobian import Evaluation
-from warpfrag.fit.outcome import Outcome
 from warpfrag.fit.problem import Problem
 from warpfrag.fit.session import FitError, Session, check_finite
 

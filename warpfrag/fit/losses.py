@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from warpfrag.scene.errors import shorten
+from warpfrag.errors import shorten
 
 ROBUST = ("l2", "l1", "huber")
 LOSSES = (*ROBUST, "ssim")

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from warpfrag.fit.parameters import Variable
-from warpfrag.scene.objects import Scene
+from warpfrag.scene.scene import Scene
 
 
 def level_of(variable: Variable, stage: int) -> int:

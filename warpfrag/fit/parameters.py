@@ -11,11 +11,11 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from warpfrag.capture.precision import z_resolution
+from warpfrag.errors import shorten, suggest
 from warpfrag.scene.camera import Camera
-from warpfrag.scene.errors import shorten, suggest
-from warpfrag.scene.objects import Scene, SceneObject, multiple_of_p
+from warpfrag.scene.depth_resolution import z_resolution
 from warpfrag.scene.pose import CAMERA, POSE_KEYS
+from warpfrag.scene.scene import Scene, SceneObject, multiple_of_p
 
 Per = Literal["object", "vertex", "pixel", "view"]
 PER = get_args(Per)

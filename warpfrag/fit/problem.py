@@ -10,18 +10,18 @@ from typing import Any
 
 import numpy as np
 
+from warpfrag.arrays.operator import kind_of
+from warpfrag.capture.bounded import capture_kbuffer
 from warpfrag.capture.coverage import Coverage
-from warpfrag.capture.kbuffer import capture_kbuffer
-from warpfrag.capture.render import over_background, render
 from warpfrag.composite import composite
-from warpfrag.fit.frozen import UnitFragments
 from warpfrag.fit.parameters import in_multiples_of_p, placed
 from warpfrag.fit.processes import Processes
+from warpfrag.fit.scaled_fragments import UnitFragments
 from warpfrag.fit.study import RENDER_OPTIONS, Study, View, true_of_view
 from warpfrag.fragments import Fragments
-from warpfrag.interop.operator import kind_of
-from warpfrag.resolve.kbuffer import kbuffer
-from warpfrag.scene.objects import Scene
+from warpfrag.render import over_background, render
+from warpfrag.scene.scene import Scene
+from warpfrag.storage.kbuffer import kbuffer
 
 # Random starts keep this share of the range away from the bounds.
 _MARGIN = 0.1

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from warpfrag.files.images import write_image
+from warpfrag.files.saving import replacing
 from warpfrag.fit.losses import psnr
 from warpfrag.fit.parameters import value_words
-from warpfrag.images import write_image
-from warpfrag.saving import replacing
 from warpfrag.versions import package_versions
 
 # Arrays with more numbers than this are written beside result.json, not into it.
@@ -77,7 +77,7 @@ class FitResult:
         standard_errors: one standard error of each found parameter in its own unit, from the Jacobian and the variance
             of the residuals; inf where the image does not depend on it. None unless every parameter is global.
         condition_number: of the Jacobian (thicknesses as logarithms); None unless every parameter is global.
-        undetermined: names of the parameters the image does not determine, see `warpfrag.fit.outcome.assess`.
+        undetermined: names of the parameters the image does not determine, see `warpfrag.fit.certainty.assess`.
         loss: the least loss.
         losses: the loss of each step from the start that led there.
         evaluations: times that the images were computed, from all starts.
@@ -201,7 +201,7 @@ class FitResult:
             ImageError: a file cannot be written.
             ImportError: matplotlib is not installed.
         """
-        from warpfrag.fit.report import draw_error, draw_loss
+        from warpfrag.fit.plots import draw_error, draw_loss
 
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)

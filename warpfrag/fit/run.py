@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 
 from warpfrag.extras import need
-from warpfrag.fit.bar import progress_bar
+from warpfrag.files.saving import remove_partial
 from warpfrag.fit.parameters import placed
 from warpfrag.fit.processes import is_first_process
+from warpfrag.fit.progress import progress_bar
 from warpfrag.fit.result import FitResult, Run, ViewResult, plain_value
 from warpfrag.fit.session import CHECKPOINT, FitError, Progress, Session, fingerprint
 from warpfrag.fit.study import Study
 from warpfrag.fit.study_file import load_study
-from warpfrag.saving import remove_partial
 
 
 def fit(
@@ -152,9 +152,9 @@ def _certainty(
     problem: Any, coordinates: np.ndarray, found: dict[str, Any]
 ) -> tuple[dict[str, Any] | None, float | None, tuple[str, ...]]:
     """Return standard errors, condition number and what is undetermined; nothing where some parameter is not global."""
+    from warpfrag.fit.certainty import assess
     from warpfrag.fit.jacobian import Evaluation
     from warpfrag.fit.losses import RobustLoss
-    from warpfrag.fit.outcome import assess
 
     study = problem.study
     if not study.is_global:

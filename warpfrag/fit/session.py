@@ -20,10 +20,10 @@ from typing import Any
 
 import numpy as np
 
+from warpfrag.files.saving import replacing
 from warpfrag.fit.parameters import values_words
 from warpfrag.fit.processes import Processes
 from warpfrag.fit.study import Study
-from warpfrag.saving import replacing
 
 CHECKPOINT = "checkpoint.dat"
 # Of the file's layout; another one is not read.

@@ -7,6 +7,8 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
+from warpfrag.errors import shorten
+from warpfrag.files.table import is_number
 from warpfrag.fit.losses import ImageLoss
 from warpfrag.fit.parameters import (
     FitParameter,
@@ -17,11 +19,9 @@ from warpfrag.fit.parameters import (
     scene_value,
     thickness_units,
 )
+from warpfrag.scene.assemble import assemble
 from warpfrag.scene.camera import Camera
-from warpfrag.scene.errors import shorten
-from warpfrag.scene.geometry import assemble
-from warpfrag.scene.objects import MERGES, MIXES, Scene
-from warpfrag.scene.table import is_number
+from warpfrag.scene.scene import MERGES, MIXES, Scene
 
 Method = Literal["least_squares", "adam", "lbfgs"]
 Resolve = Literal["sorted", "kbuffer"]

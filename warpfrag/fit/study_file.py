@@ -28,14 +28,14 @@ from typing import Any, get_args
 
 import numpy as np
 
+from warpfrag.colors import parse_hex
+from warpfrag.errors import SceneError, shorten
+from warpfrag.files.images import ImageError, read_image
+from warpfrag.files.scene_file import CAMERA_KEYS, load_scene, read_camera, read_size
+from warpfrag.files.table import Table, is_number, is_numbers, read_toml
 from warpfrag.fit.parameters import PER, FitParameter, check_name, flatten_names
 from warpfrag.fit.study import RENDER_OPTIONS, Method, Reference, Resolve, Study, StudyError, View
-from warpfrag.images import ImageError, read_image
-from warpfrag.scene.colors import parse_hex
-from warpfrag.scene.errors import SceneError, shorten
-from warpfrag.scene.files import CAMERA_KEYS, load_scene, read_camera, read_size
-from warpfrag.scene.objects import MERGES, MIXES, Scene, multiple_of_p
-from warpfrag.scene.table import Table, is_number, is_numbers, read_toml
+from warpfrag.scene.scene import MERGES, MIXES, Scene, multiple_of_p
 
 _INTEGERS = ("steps", "seed", "restarts", "scales", "patience", "batch")
 _NUMBERS = ("delta", "tolerance", "learning_rate", "checkpoint_seconds")

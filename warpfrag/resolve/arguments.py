@@ -7,10 +7,9 @@ from typing import Any, Literal, get_args
 import numpy as np
 import warp as wp
 
+from warpfrag.arrays.launch import Span, launch, worker_count
+from warpfrag.arrays.operator import dtype_name, kind_of, vectors
 from warpfrag.fragments import Fragments
-from warpfrag.interop.launch import Span, launch, worker_count
-from warpfrag.interop.operator import dtype_name, kind_of, vectors
-from warpfrag.operators import MIX_AVERAGE, MIX_OPACITY, MIX_OPTICAL_DEPTH
 from warpfrag.resolve.walk import (
     MERGE_EXACT,
     MERGE_NONE,
@@ -24,7 +23,8 @@ from warpfrag.resolve.walk import (
     Scratch32,
     Scratch64,
 )
-from warpfrag.slabs import LOG_FLOOR, LOG_OPAQUE, Slab32, Slab64
+from warpfrag.slabs.operators import MIX_AVERAGE, MIX_OPACITY, MIX_OPTICAL_DEPTH
+from warpfrag.slabs.slab import LOG_FLOOR, LOG_OPAQUE, Slab32, Slab64
 
 Merge = Literal["none", "smooth", "order_independent", "exact"]
 Mix = Literal["opacity", "average", "optical_depth"]

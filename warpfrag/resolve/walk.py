@@ -13,8 +13,8 @@ from typing import Any
 
 import warp as wp
 
-from warpfrag.operators import ofm, ofm_adjoint, over, over_adjoint, sfm, sfm_adjoint, sfm_powers
-from warpfrag.slabs import NEGLIGIBLE, WEIGHT_LIMIT, Slab32, Slab64, divide, log_transmittance, overlap, slab
+from warpfrag.slabs.operators import ofm, ofm_adjoint, over, over_adjoint, sfm, sfm_adjoint, sfm_powers
+from warpfrag.slabs.slab import NEGLIGIBLE, WEIGHT_LIMIT, Slab32, Slab64, divide, log_transmittance, overlap, slab
 
 wp.set_module_options({"enable_backward": False})
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from warpfrag.scene.errors import shorten
+from warpfrag.errors import shorten
 
 
 @dataclass(frozen=True)

@@ -19,11 +19,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from warpfrag.errors import shorten
 from warpfrag.scene.camera import Camera
-from warpfrag.scene.errors import shorten
 
 if TYPE_CHECKING:
-    from warpfrag.scene.objects import Scene
+    from warpfrag.scene.scene import Scene
 
 POSE_KEYS = ("translation", "rotation")
 # Whose parameters are the camera's; no object may be named so.

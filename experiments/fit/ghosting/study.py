@@ -17,10 +17,10 @@ from figures import draw  # noqa: E402
 from target import MODULATION, Target, make_target  # noqa: E402
 
 import warpfrag as wf  # noqa: E402
+from warpfrag.files.images import write_image  # noqa: E402
 from warpfrag.fit import Reference, Study, load_study  # noqa: E402
 from warpfrag.fit.losses import psnr  # noqa: E402
-from warpfrag.fit.summary import Figure, Summary, Table  # noqa: E402
-from warpfrag.images import write_image  # noqa: E402
+from warpfrag.studies.summary import Figure, Summary, Table  # noqa: E402
 
 HERE = Path(__file__).parent
 OBJECTS = ("outer", "inner", "gem")

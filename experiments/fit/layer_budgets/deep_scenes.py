@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 import warpfrag as wf
-from warpfrag.scene.mesh import Mesh, lambert
-from warpfrag.scene.points import surfels
+from warpfrag.shapes.mesh import Mesh, lambert
+from warpfrag.shapes.surfels import surfels
 
 HERE = Path(__file__).parent
 # The shapes are those of the study of order-independent transparency.

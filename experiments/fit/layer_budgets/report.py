@@ -8,8 +8,8 @@ from typing import Any
 from budget import BUDGETS, METHODS, OPEN, psnr
 from maps import BLOCK, RULES
 
-from warpfrag.fit.summary import Figure, Summary, Table
-from warpfrag.saving import replacing
+from warpfrag.files.saving import replacing
+from warpfrag.studies.summary import Figure, Summary, Table
 
 HERE = Path(__file__).parent
 RESULTS = Path("results") / "fit" / "layer_budgets"

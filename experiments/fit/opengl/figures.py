@@ -6,8 +6,8 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 import warpfrag as wf
+from warpfrag.files.images import linear_to_srgb
 from warpfrag.fit.losses import psnr
-from warpfrag.images import linear_to_srgb
 
 STYLE = {"font.size": 9, "axes.titlesize": 9, "axes.spines.top": False, "axes.spines.right": False}
 COLORS = {"pyrender": "#1f78b4", "ours": "#ff7f00"}

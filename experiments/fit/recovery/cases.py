@@ -8,9 +8,9 @@ import numpy as np
 
 import warpfrag as wf
 from warpfrag.fit.study import View
-from warpfrag.scene.mesh import Mesh, lambert, smooth_normals
-from warpfrag.scene.points import PointSet, surfels
-from warpfrag.scene.primitives import sphere
+from warpfrag.shapes.mesh import Mesh, lambert, smooth_normals
+from warpfrag.shapes.primitives import sphere
+from warpfrag.shapes.surfels import PointSet, surfels
 
 SCENES = Path("scenes")
 WHITE = (1.0, 1.0, 1.0, 1.0)

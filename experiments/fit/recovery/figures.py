@@ -9,7 +9,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from recover import METHODS, RECOVERED
 
-from warpfrag.saving import replacing
+from warpfrag.files.saving import replacing
 
 NAMES = {"smooth": "SFM", "exact": "exact"}
 COLORS = dict(zip(METHODS, ("#1f78b4", "#6a3d9a", "#ff7f00", "#33a02c", "#8c8c8c"), strict=True))

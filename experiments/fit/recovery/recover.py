@@ -13,11 +13,11 @@ import numpy as np
 from cases import Case
 
 from warpfrag.fit import FitParameter, Reference, Study
+from warpfrag.fit.certainty import SMALLEST_NOISE, assess
 from warpfrag.fit.descent import LBFGS, Adam
 from warpfrag.fit.jacobian import Evaluation
 from warpfrag.fit.least_squares import LeastSquares
 from warpfrag.fit.losses import RobustLoss
-from warpfrag.fit.outcome import SMALLEST_NOISE, assess
 from warpfrag.fit.problem import Problem, ViewProblem
 from warpfrag.fit.session import Progress, Session
 

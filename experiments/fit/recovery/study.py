@@ -26,8 +26,8 @@ from figures import draw_identifiability, draw_recovery  # noqa: E402
 from recover import METHODS, RECOVERED, Setting  # noqa: E402
 from scipy.stats import binomtest  # noqa: E402
 
-from warpfrag.fit.summary import Figure, Summary, Table  # noqa: E402
-from warpfrag.saving import replacing  # noqa: E402
+from warpfrag.files.saving import replacing  # noqa: E402
+from warpfrag.studies.summary import Figure, Summary, Table  # noqa: E402
 
 FOLDER = Path(__file__).parent
 RESULTS = Path("results") / "fit" / "recovery"

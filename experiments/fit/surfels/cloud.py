@@ -6,12 +6,12 @@ import numpy as np
 import trimesh
 
 import warpfrag as wf
-from warpfrag.images import linear_to_srgb
+from warpfrag.files.images import linear_to_srgb
+from warpfrag.files.meshes import load_mesh
 from warpfrag.scene.camera import Camera
-from warpfrag.scene.loading import load_mesh
-from warpfrag.scene.mesh import Mesh, lambert, smooth_normals
-from warpfrag.scene.objects import Scene, SceneObject
-from warpfrag.scene.points import PointSet
+from warpfrag.scene.scene import Scene, SceneObject
+from warpfrag.shapes.mesh import Mesh, lambert, smooth_normals
+from warpfrag.shapes.surfels import PointSet
 
 # Times that the mesh's edges are halved: colours between vertices are then close to `paint`.
 HALVINGS = 2

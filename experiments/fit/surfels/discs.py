@@ -4,8 +4,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from warpfrag.scene.objects import SceneObject
-from warpfrag.scene.points import PointSet, spacing, surfels
+from warpfrag.scene.scene import SceneObject
+from warpfrag.shapes.surfels import PointSet, spacing, surfels
 
 # Rim of discs that fall off [spacings], and corners of all: those of the library's surfels.
 RIM, SEGMENTS = 2.0, 8

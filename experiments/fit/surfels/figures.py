@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from tied import Tied
 
+from warpfrag.files.images import linear_to_srgb
 from warpfrag.fit.losses import psnr
-from warpfrag.images import linear_to_srgb
 from warpfrag.resolve.arguments import Merge
 
 STYLE = {

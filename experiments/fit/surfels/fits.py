@@ -10,7 +10,7 @@ import warpfrag as wf
 from warpfrag.fit import FitParameter, FitResult, Study, View
 from warpfrag.fit.losses import psnr
 from warpfrag.resolve.arguments import Merge
-from warpfrag.scene.objects import Scene
+from warpfrag.scene.scene import Scene
 
 OPAQUE, FALLOFF = "opaque", "falloff"
 # Of the falloff that is set by hand [spacings].

@@ -21,12 +21,12 @@ from tied import Tied, fit_tied  # noqa: E402
 
 import warpfrag as wf  # noqa: E402
 from warpfrag.capture.coverage import Coverage  # noqa: E402
+from warpfrag.files.images import write_image  # noqa: E402
 from warpfrag.fit import Progress, Reference, load_study  # noqa: E402
 from warpfrag.fit.losses import psnr  # noqa: E402
-from warpfrag.fit.summary import Figure, Summary, Table  # noqa: E402
-from warpfrag.images import write_image  # noqa: E402
 from warpfrag.resolve.arguments import Merge  # noqa: E402
-from warpfrag.scene.mesh import Mesh  # noqa: E402
+from warpfrag.shapes.mesh import Mesh  # noqa: E402
+from warpfrag.studies.summary import Figure, Summary, Table  # noqa: E402
 
 HERE = Path(__file__).parent
 COMMAND = "uv run python experiments/fit/surfels/study.py"

@@ -11,10 +11,10 @@ import numpy as np
 
 import warpfrag as wf
 from warpfrag.capture.capture import to_camera_space
-from warpfrag.scene import primitives
+from warpfrag.scene.assemble import assemble
 from warpfrag.scene.camera import Camera
-from warpfrag.scene.geometry import assemble
-from warpfrag.scene.objects import Scene, SceneObject
+from warpfrag.scene.scene import Scene, SceneObject
+from warpfrag.shapes import primitives
 
 BUFFERS = ("eye", "fixed", "float", "rasteriser")
 # Columns, rows and turn in the plane [degrees] of the two planes' triangles: none in common.

@@ -19,7 +19,7 @@ from speckle import VISIBLE, WAYS, Case, clear_from, examine, left_over, offset_
 
 import warpfrag as wf  # noqa: E402
 from warpfrag.fit import load_study  # noqa: E402
-from warpfrag.fit.summary import Figure, Summary, Table  # noqa: E402
+from warpfrag.studies.summary import Figure, Summary, Table  # noqa: E402
 
 HERE = Path(__file__).parent
 # The paper's multiples: in general, for points, in its study of transparency.

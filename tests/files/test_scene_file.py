@@ -1,0 +1,246 @@
+"""Scene files: what they mean, and one line for each thing that can be wrong with them."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from warpfrag.errors import SceneError
+from warpfrag.files.scene_file import load_scene
+
+SCENES = sorted((Path(__file__).parents[2] / "scenes").glob("*.toml"))
+CAMERA = "[camera]\neye = [0, 0, 3]\ntarget = [0, 0, 0]\nfov = 45.0\n"
+TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
+
+
+def write(folder, text, name="scene.toml"):
+    """Write a file, its folder too, and return its path."""
+    folder.mkdir(exist_ok=True)
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+def objects(folder, body, head=""):
+    """Return the objects of a scene with a camera."""
+    return load_scene(write(folder, head + CAMERA + body)).objects
+
+
+def only(folder, keys, head=""):
+    """Return the one object of a scene that has a sphere with these keys."""
+    (item,) = objects(folder, '[[object]]\nprimitive = "sphere"\nsegments = 8\n' + keys, head)
+    return item
+
+
+def test_a_whole_scene(tmp_path):
+    """Globals, camera and objects arrive as written, in their own units."""
+    write(tmp_path, TRIANGLE, "tri.obj")
+    head = 'beta = 0.5\nlayers = 4\nmerge = "none"\nmix = "average"\nbackground = [1.0, 0.5, 0, 0.5]\n'
+    body = (
+        '[[object]]\nmesh = "tri.obj"\nopacity = 0.25\nthickness = 0.05\ncolor = [0.9, 0.6, 0.3]\n'
+        '[[object]]\nprimitive = "cube"\nsize = 2\nthickness = "3.5P"\ncolor = "#80ff00"\n'
+    )
+    scene = load_scene(write(tmp_path, head + CAMERA + body))
+    assert (scene.beta, scene.layers, scene.merge, scene.mix) == (0.5, 4, "none", "average")
+    assert scene.background == (0.5, 0.25, 0.0, 0.5)
+    assert (scene.camera.eye, scene.camera.fov, scene.camera.size) == ((0, 0, 3), 45, (512, 512))
+    first, second = scene.objects
+    assert (first.name, first.opacity, first.thickness, first.thickness_unit) == ("tri", 0.25, 0.05, "scene")
+    np.testing.assert_allclose(first.color, [0.9, 0.6, 0.3], rtol=1e-6)
+    assert first.shade is None
+    assert (second.name, second.opacity, second.thickness, second.thickness_unit) == ("cube", 1.0, 3.5, "P")
+    # 0x80/255 in sRGB is 0.2158605 in linear light.
+    np.testing.assert_allclose(second.color, [0.2158605, 1.0, 0.0], rtol=1e-6)
+    np.testing.assert_array_equal(np.abs(second.vertices), np.ones((24, 3)))
+
+
+def test_defaults(tmp_path):
+    """An object says only what it is: 0.8 grey, opaque, 2P, in place."""
+    item = only(tmp_path, "")
+    np.testing.assert_allclose(item.color, [0.8] * 3, rtol=1e-6)
+    assert (item.opacity, item.thickness, item.thickness_unit) == (1.0, 2.0, "P")
+    np.testing.assert_array_equal(item.matrix, np.eye(4))
+
+
+def test_transforms_scale_then_rotate_then_translate(tmp_path):
+    """A point is scaled, turned by each rotation in order, and moved: worked by hand."""
+    turn = "rotate = [{ axis = [0, 0, 2], degrees = 90 }, { axis = [1, 0, 0], degrees = 90 }]\n"
+    item = only(tmp_path, "scale = [2, 3, 4]\n" + turn + "translate = [10, 20, 30]\n")
+    # (1, 0, 0) -> (2, 0, 0) -> (0, 2, 0) -> (0, 0, 2) -> (10, 20, 32)
+    np.testing.assert_allclose(item.matrix @ [1, 0, 0, 1], [10, 20, 32, 1], atol=1e-12)
+    item = only(tmp_path, "matrix = [[1, 0, 0, 5], [0, 0, -1, 6], [0, 1, 0, 7], [0, 0, 0, 1]]\n")
+    np.testing.assert_array_equal(item.matrix @ [0, 1, 0, 1], [5, 6, 8, 1])
+
+
+def test_light_bakes_a_factor_per_vertex(tmp_path):
+    """A light along z: the poles of a sphere get the ambient part alone, its front and back the full colour."""
+    item = only(tmp_path, "", "[light]\ndirection = [0, 0, 2]\nambient = 0.25\n")
+    expected = 0.25 + 0.75 * np.abs(item.vertices[:, 2])
+    np.testing.assert_allclose(item.shade, expected, atol=1e-6)
+    head = only(tmp_path, "translate = [0, 0, -50]\n", '[light]\ndirection = "camera"\n')
+    np.testing.assert_allclose(head.shade, 0.3 + 0.7 * np.abs(head.vertices[:, 2]), atol=0.03)
+
+
+def test_flat_normals_split_the_vertices(tmp_path):
+    """With `normals = "flat"` the three corners of a face have one factor and belong to it alone."""
+    item = only(tmp_path, 'normals = "flat"\n', "[light]\ndirection = [1, 2, 3]\n")
+    assert len(item.vertices) == 3 * len(item.faces)
+    assert np.ptp(item.shade.reshape(-1, 3), axis=1).max() == 0.0
+    cube = 'primitive = "cube"\nname = "{}"\n'
+    light = "[light]\ndirection = [1, 2, 3]\n"
+    sharp, smooth = objects(
+        tmp_path, "[[object]]\n" + cube.format("a") + "[[object]]\n" + cube.format("b") + 'normals = "smooth"\n', light
+    )
+    assert len(np.unique(sharp.shade)) == 3
+    assert len(np.unique(smooth.shade.round(6))) == 4
+
+
+def test_texture_key(tmp_path):
+    """An image gets linear, is tinted by the colour, and gives a primitive its texture coordinates."""
+    Image.fromarray(np.array([[[255, 128, 0, 51]]], dtype=np.uint8)).save(tmp_path / "dot.png")
+    item = only(tmp_path, 'texture = "dot.png"\n')
+    np.testing.assert_allclose(item.texture, [[[1.0, 0.2158605, 0.0, 0.2]]], rtol=1e-6)
+    np.testing.assert_array_equal(item.color, [1, 1, 1])
+    assert item.uv.shape == (len(item.vertices), 2)
+    assert only(tmp_path, 'texture = "dot.png"\ncolor = [0.5, 1, 1]\nopacity = 0.5\n').opacity == 0.5
+
+
+@pytest.mark.parametrize("path", SCENES, ids=lambda path: path.stem)
+def test_shipped_scenes_load(path):
+    """Every scene that comes with the project can be read, is lit, and fits into its image."""
+    if "usd" in path.read_text():
+        pytest.importorskip("pxr", reason="usd-core is not installed")
+    scene = load_scene(path)
+    assert path.read_text().startswith("# ")
+    assert scene.camera.size == (512, 512)
+    for item in scene.objects:
+        assert item.shade.min() >= 0.3
+        x, y, z = (np.c_[item.world_vertices(), np.ones(len(item.vertices))] @ scene.camera.view_matrix().T).T[:3]
+        assert z.min() > scene.camera.near
+        assert z.max() < scene.camera.far
+        assert np.abs(x / z).max() * scene.camera.focal < 256
+        assert np.abs(y / z).max() * scene.camera.focal < 256
+
+
+BALL = '[[object]]\nname = "ball"\nprimitive = "sphere"\n'
+COMPLAINTS = {
+    "syntax": ("beta = 0.5\neye = = 1\n", "line 2: found what is not TOML"),
+    "open end": ("beta = [0.5\n", "line 1: found what is not TOML"),
+    "no camera": (BALL, "camera: found none"),
+    "no objects": (CAMERA, r"object: found none, expected one or more tables headed \[\[object\]\]"),
+    "one object": (CAMERA + '[object]\nname = "x"\n', "object: found one table"),
+    "top key": ("bta = 1\n" + CAMERA + BALL, 'bta: found an unknown key; did you mean "beta"?'),
+    "camera key": (CAMERA + "foov = 3\n" + BALL, r'camera.foov: found an unknown key; did you mean "fov"\?'),
+    "camera eye": ("[camera]\ntarget = [0, 0, 0]\nfov = 1\n" + BALL, "camera.eye: found none, expected 3 numbers"),
+    "camera both": (CAMERA + "height = 2.0\n" + BALL, "camera: found both of fov and height"),
+    "near far": (CAMERA + "near = 5\nfar = 1\n" + BALL, "camera.far: found 1"),
+    "size": (CAMERA + "size = [512.0, 512]\n" + BALL, "camera.size: found .*two whole numbers"),
+    "huge size": (CAMERA + "size = [1000000, 512]\n" + BALL, "camera.size"),
+    "beta range": ("beta = 1.5\n" + CAMERA + BALL, "beta: found 1.5, expected a number from 0 to 1"),
+    "beta nan": ("beta = nan\n" + CAMERA + BALL, "beta: found nan"),
+    "beta bool": ("beta = true\n" + CAMERA + BALL, "beta: found true, expected a number from 0 to 1"),
+    "layers": ("layers = 0\n" + CAMERA + BALL, "layers: found 0, expected a whole number from 1"),
+    "merge": ('merge = "smoth"\n' + CAMERA + BALL, r'merge: found "smoth", expected one of .*did you mean "smooth"\?'),
+    "background": (
+        'background = "white"\n' + CAMERA + BALL,
+        r'background: found "white", expected 3 numbers .*#rrggbb',
+    ),
+    "light": (CAMERA + "[light]\ndirection = [0, 0, 0]\n" + BALL, "light.direction"),
+    "ambient": (CAMERA + "[light]\nambient = -1\n" + BALL, "light.ambient: found -1"),
+    "no shape": (
+        CAMERA + '[[object]]\nname = "x"\n',
+        r'object\[0\] of "x": found no shape, expected mesh, primitive or points',
+    ),
+    "both": (CAMERA + BALL + 'mesh = "a.obj"\n', "found both mesh and primitive"),
+    "primitive": (CAMERA + '[[object]]\nprimitive = "spere"\n', r'object\[0\].primitive: .*did you mean "sphere"\?'),
+    "other size": (CAMERA + BALL + "tube = 1\n", 'tube of "ball": found an unknown key of primitive "sphere"'),
+    "object key": (CAMERA + BALL + "opacty = 1\n", r'object\[0\].opacty of "ball": .*did you mean "opacity"\?'),
+    "opacity": (
+        CAMERA + BALL + "opacity = 1.5\n",
+        r'object\[0\].opacity of "ball": found 1.5, expected a number from 0',
+    ),
+    "radius": (CAMERA + BALL + "radius = -1\n", "radius.*found -1, expected a number above 0"),
+    "radius text": (CAMERA + BALL + 'radius = "1"\n', 'radius.*found "1", expected a number above 0'),
+    "segments": (CAMERA + BALL + "segments = 2\n", "segments.*found 2, expected a whole number from 3"),
+    "thickness": (CAMERA + BALL + "thickness = -1\n", 'thickness.*found -1, expected a number from 0, or .*"2P"'),
+    "thickness text": (CAMERA + BALL + 'thickness = "-2P"\n', 'thickness.*found "-2P"'),
+    "thickness inf": (CAMERA + BALL + "thickness = inf\n", "thickness.*found inf"),
+    "color": (CAMERA + BALL + "color = [1, 2, 3]\n", "color.*expected 3 numbers from 0 to 1"),
+    "color hex": (CAMERA + BALL + 'color = "#12345"\n', 'color.*found "#12345"'),
+    "scale": (CAMERA + BALL + "scale = 0\n", "scale.*found 0, expected a number other than 0"),
+    "rotate": (CAMERA + BALL + "rotate = { axis = [0, 0, 0], degrees = 1 }\n", "rotate.*axis other than 0"),
+    "rotate key": (CAMERA + BALL + "rotate = { axis = [0, 0, 1], degree = 1 }\n", 'rotate.degree.*"degrees"'),
+    "matrix": (CAMERA + BALL + "matrix = [[1, 0], [0, 1]]\n", "matrix.*expected 4 rows of 4 numbers"),
+    "matrix flat": (CAMERA + BALL + f"matrix = {[[1, 0, 0, 0]] * 3 + [[0, 0, 0, 1]]}\n", "matrix.*invertible"),
+    "matrix too": (CAMERA + BALL + f"scale = 1\nmatrix = {np.eye(4).tolist()}\n", "matrix.*found scale as well"),
+    "same name": (CAMERA + BALL + BALL, r'object\[1\].name: found "ball", which object\[0\] has too'),
+    "camera name": (
+        CAMERA + '[[object]]\nname = "camera"\nprimitive = "cube"\n',
+        r'object\[0\].name: found "camera", expected another',
+    ),
+    "blank name": (CAMERA + '[[object]]\nname = ""\nprimitive = "cube"\n', "name.*not blank"),
+    "normals": (CAMERA + BALL + 'normals = "smoth"\n', "normals.*did you mean"),
+    "no mesh": (CAMERA + '[[object]]\nmesh = "trii.obj"\n', r'mesh: found no such file at .*did you mean "tri.obj"'),
+    "kind": (CAMERA + '[[object]]\nmesh = "scene.toml"\n', r"mesh: found the mesh file .* of an unknown kind.*\.ply"),
+    "asset": (
+        CAMERA + '[[object]]\nmesh = "warp:buny.usd"\n',
+        r'mesh: found no "buny.usd".*did you mean "bunny.usd"\?',
+    ),
+    "empty mesh": (CAMERA + '[[object]]\nmesh = "points.obj"\n', "mesh: found no faces in"),
+    "broken mesh": (CAMERA + '[[object]]\nmesh = "broken.ply"\n', "mesh: found a ply file that cannot be read"),
+    "texture": (CAMERA + BALL + 'texture = "no.png"\n', "texture.*found no such file"),
+    "texture kind": (CAMERA + BALL + 'texture = "tri.obj"\n', "texture.*an image that cannot be read"),
+    "no uv": (CAMERA + '[[object]]\nmesh = "tri.obj"\ntexture = "a.png"\n', "texture.*without texture coordinates"),
+}
+
+
+@pytest.mark.parametrize("case", COMPLAINTS)
+def test_complaints(tmp_path, case):
+    """One line: the file, the key, what was found, what is expected."""
+    write(tmp_path, TRIANGLE, "tri.obj")
+    write(tmp_path, "v 0 0 0\nv 1 1 1\n", "points.obj")
+    write(tmp_path, "ply\nformat ascii 1.0\nelement vertex 3\nnonsense\n", "broken.ply")
+    text, words = COMPLAINTS[case]
+    path = write(tmp_path, text)
+    with pytest.raises(SceneError, match=words) as caught:
+        load_scene(path)
+    message = str(caught.value)
+    assert message.startswith(f"{path}: ")
+    assert "\n" not in message
+
+
+def test_missing_scene_file(tmp_path):
+    """A scene that is not there is named."""
+    with pytest.raises(SceneError, match=r"nothing.toml: found no such file"):
+        load_scene(tmp_path / "nothing.toml")
+    (tmp_path / "bytes.toml").write_bytes(b"beta = \xff")
+    with pytest.raises(SceneError, match="not UTF-8"):
+        load_scene(tmp_path / "bytes.toml")
+
+
+@pytest.mark.parametrize("way", ["dots", "link", "folder link", "texture"])
+def test_relative_paths_stay_inside(tmp_path, way):
+    """A relative path out of the scene's folder is refused, through '..' as through links; an absolute one is not."""
+    outside = write(tmp_path / "outside", TRIANGLE, "tri.obj")
+    folder = tmp_path / "inside"
+    folder.mkdir()
+    if way == "link":
+        os.symlink(outside, folder / "tri.obj")
+    if way == "folder link":
+        os.symlink(outside.parent, folder / "below")
+    text = {"dots": "../outside/tri.obj", "link": "tri.obj", "folder link": "below/tri.obj", "texture": "../a.png"}[way]
+    keys = f'primitive = "plane"\ntexture = "{text}"\n' if way == "texture" else f'mesh = "{text}"\n'
+    with pytest.raises(SceneError, match=r"outside of .*expected a file in it or below, or an absolute path"):
+        objects(folder, "[[object]]\n" + keys)
+    assert len(objects(folder, f'[[object]]\nmesh = "{outside}"\n')[0].faces) == 1
+
+
+def test_paths_below_and_through_the_folder_are_fine(tmp_path):
+    """Folders below, and '..' that comes back, are inside; a scene reached by a linked folder reads beside itself."""
+    write(tmp_path / "real", "")
+    write(tmp_path / "real" / "sub", TRIANGLE, "tri.obj")
+    os.symlink(tmp_path / "real", tmp_path / "alias")
+    for text in ("sub/tri.obj", "sub/../sub/tri.obj"):
+        assert objects(tmp_path / "alias", f'[[object]]\nmesh = "{text}"\n')[0].name == "tri"

@@ -1,0 +1,91 @@
+"""Cameras: conventions of camera space, sizes, and refusals."""
+
+import math
+
+import numpy as np
+import pytest
+
+from warpfrag.scene.camera import Camera
+
+
+def project(camera, point):
+    """Pixel coordinates (column, row) of a world point."""
+    x, y, z = (camera.view_matrix() @ [*point, 1.0])[:3]
+    width, height = camera.size
+    if camera.is_perspective:
+        return x / z * camera.focal + width / 2, y / z * camera.focal + height / 2
+    return x / camera.pixel_size + width / 2, y / camera.pixel_size + height / 2
+
+
+def test_view_matrix_of_a_camera_on_the_z_axis():
+    """From +z towards the origin: x right, y down, z forward, worked by hand."""
+    camera = Camera(eye=(0, 0, 3), target=(0, 0, 0), fov=60)
+    np.testing.assert_allclose(
+        camera.view_matrix(), [[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 3], [0, 0, 0, 1]], atol=1e-15
+    )
+
+
+@pytest.mark.parametrize("up", [(0, 1, 0), (0, 1e-200, 0), (0.3, 1e150, 0)])
+def test_view_matrix_is_a_rotation(up):
+    """The axes are orthonormal and right-handed, for every length of up."""
+    rotation = Camera(eye=(1, 2, 3), target=(-1, 0.5, 2), up=up, fov=60).view_matrix()[:3, :3]
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(rotation) == pytest.approx(1.0)
+
+
+def test_perspective_projects_the_edges_of_the_field_of_view():
+    """A point on the upper edge of the vertical field of view lands on row 0, the target in the middle."""
+    camera = Camera(eye=(0, 0, 2), target=(0, 0, 0), fov=90, size=(64, 48))
+    assert camera.focal == pytest.approx(24.0)
+    assert project(camera, (0, 0, 0)) == pytest.approx((32, 24))
+    assert project(camera, (0, 2, 0)) == pytest.approx((32, 0))
+    assert project(camera, (1, 0, 0))[0] > 32
+
+
+def test_orthographic_height_spans_the_image():
+    """`height` is the vertical extent in scene units; depth does not matter."""
+    camera = Camera(eye=(0, 0, 2), target=(0, 0, 0), height=3.0, size=(60, 30))
+    assert camera.pixel_size == pytest.approx(0.1)
+    assert not camera.is_perspective
+    for depth in (-5, 0, 1):
+        assert project(camera, (3, 1.5, depth)) == pytest.approx((60, 0))
+
+
+def test_shape_and_resized():
+    """Size is (width, height), shape is (H, W); resizing keeps the vertical field of view."""
+    camera = Camera(eye=(0, 0, 2), target=(0, 0, 0), fov=40, size=(64, 48)).resized((128, 96))
+    assert (camera.width, camera.shape) == (128, (96, 128))
+    assert camera.focal == pytest.approx(48 / math.tan(math.radians(20)))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"fov": None}, "camera: found neither of fov and height"),
+        ({"height": 1.0}, "camera: found both of fov and height"),
+        ({"fov": 180}, "camera.fov: found 180"),
+        ({"fov": None, "height": 0}, "camera.height: found 0"),
+        ({"near": 0}, "camera.near: found 0"),
+        ({"near": 2, "far": 2}, r"camera.far: found 2, expected a number above near \(2\)"),
+        ({"target": (0, 0, 2)}, "camera.target: found the eye itself"),
+        ({"up": (0, 0, -3)}, "camera.up"),
+        ({"up": (0, 0, 0)}, "camera.up"),
+        ({"eye": (0, float("nan"), 2)}, "camera.eye: found nan"),
+        ({"eye": (0, 2)}, "camera.eye: found .*expected 3 numbers"),
+        ({"near": True}, "camera.near: found true"),
+        ({"size": (0, 5)}, "camera.size"),
+        ({"size": (5.5, 5)}, "camera.size"),
+    ],
+)
+def test_refusals_name_the_field(change, words):
+    """Every value out of range is refused with its name, what was found and what is expected."""
+    with pytest.raises(ValueError, match=words):
+        Camera(**{"eye": (0, 0, 2), "target": (0, 0, 0), "fov": 45.0, **change})
+
+
+def test_the_other_kind_of_camera_has_no_focal_or_pixel_size():
+    """Asking a camera for what it does not have is an error that says so."""
+    with pytest.raises(ValueError, match="orthographic camera has none"):
+        _ = Camera(eye=(0, 0, 2), target=(0, 0, 0), height=1.0).focal
+    with pytest.raises(ValueError, match="perspective camera has none"):
+        _ = Camera(eye=(0, 0, 2), target=(0, 0, 0), fov=45.0).pixel_size

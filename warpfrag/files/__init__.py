@@ -1,0 +1,1 @@
+"""Files: scenes, meshes, points and images, in and out."""

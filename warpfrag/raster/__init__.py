@@ -1,0 +1,1 @@
+"""Rays, triangles, and the walk over the pixels that triangles cover."""

@@ -1,0 +1,1 @@
+"""Exact merging: all slabs of a pixel at once."""

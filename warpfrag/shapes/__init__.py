@@ -1,0 +1,1 @@
+"""Shapes: meshes, primitives and surfels."""

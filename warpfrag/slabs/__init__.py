@@ -1,0 +1,1 @@
+"""The mathematics of slabs: each formula above its adjoint."""

@@ -1,0 +1,1 @@
+"""Storages: what a pixel does with the fragments that it is given."""

@@ -1,0 +1,1 @@
+"""Studies: what they write, all of them run together, and their report."""
