@@ -15,7 +15,7 @@ class SceneError(ValueError):
     """A scene file that cannot be used, in one line: file, key, what was got, what is expected."""
 
 
-def is_number(value: object) -> bool:
+def is_number(value: Any) -> bool:
     """Tell whether a value is a finite number, Python's or NumPy's, and not a boolean."""
     return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
 
@@ -51,9 +51,13 @@ def check_number(
     expected = range_wording(low, high, above=above)
     if not isinstance(value, Real) or isinstance(value, bool):
         raise TypeError(f"{name}: got {shorten(value)}, expected {expected}")
-    if not (is_number(value) and low <= value <= high and (above is None or value > above)):
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
+    if not (math.isfinite(number) and low <= number <= high and (above is None or number > above)):
         raise ValueError(f"{name}: got {shorten(value)}, expected {expected}")
-    return float(value)
+    return number
 
 
 def check_whole(name: str, value: Any, low: float = -math.inf, high: float = math.inf) -> int:
@@ -91,7 +95,7 @@ def suggest(word: str, choices: Iterable[str]) -> str:
     return "known are " + ", ".join(known)
 
 
-def shorten(value: object, limit: int = 60) -> str:
+def shorten(value: Any, limit: int = 60) -> str:
     """Word a value as a file would write it, on one line and cut off when long."""
     if isinstance(value, bool):
         return "true" if value else "false"
@@ -99,7 +103,7 @@ def shorten(value: object, limit: int = 60) -> str:
         return "a table"
     if isinstance(value, (Real, str)) or value is None or isinstance(value, (list, tuple)):
         # NumPy's numbers without their types.
-        plain = value.item() if hasattr(value, "item") else value
+        plain = getattr(value, "item", lambda: value)()
         text = '"' + plain.replace("\n", "\\n") + '"' if isinstance(plain, str) else " ".join(repr(plain).split())
         return text if len(text) <= limit else text[: limit - 1] + "…"
     shape = getattr(value, "shape", None)

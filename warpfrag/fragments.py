@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from warpfrag.arrays.operator import common_kind, dtype_name, kind_of
+from warpfrag.arrays.legacy import common_kind, dtype_name, kind_of
 
 
 @dataclass(frozen=True, eq=False)

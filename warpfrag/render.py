@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from warpfrag.arrays.operator import dtype_name, kind_of
+from warpfrag.arrays.legacy import dtype_name, kind_of
 from warpfrag.capture.capture import Surfaces, check_scene, fragments_of_rows, place_surfaces
 from warpfrag.capture.memory import allowed_memory, fixed_bytes, fragment_bytes, refuse, split_rows
 from warpfrag.composite import composite

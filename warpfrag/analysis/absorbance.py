@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from warpfrag.arrays.operator import kind_of
+from warpfrag.arrays.legacy import kind_of
 from warpfrag.fragments import Fragments, Layers
 from warpfrag.resolve.arguments import MIXES, Merge, Mix, check_choice
 from warpfrag.resolve.resolve import resolve

@@ -1,1 +1,1 @@
-"""Array kinds in and out, autograd and tape recording, parallel kernel launches."""
+"""What arrays and kernels are made of: kinds of arrays, precisions, operators, launches."""

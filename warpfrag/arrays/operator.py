@@ -1,19 +1,51 @@
-"""A differentiable operator, written once on Warp arrays and callable with NumPy, Warp and torch arrays.
+"""What an operator is: a differentiable function of arrays with named inputs, outputs and options.
 
-The kind of array that goes in comes out: torch tensors with autograd, Warp arrays recorded on an active `wp.Tape`,
-NumPy arrays without gradients. Arrays are shared between the kinds, not copied, wherever device and layout allow.
+It is written once, on Warp arrays; `apply` calls it with arrays of any kind. Shapes are texts of sizes, such as "F 4":
+a number stands for itself, a name for what it is in the inputs (the first that has it says; "P+1" makes P one less), or
+for what the options say in their `sizes`.
 """
 
-import sys
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from types import SimpleNamespace
 from typing import Any, Literal
 
-import numpy as np
 import warp as wp
 
-Kind = Literal["numpy", "warp", "torch"]
+Dtype = Literal["float", "int"]
 Shape = tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Input:
+    """An array argument, which may be None in a call.
+
+    Attributes:
+        name: what it is called in `inputs` and `targets`.
+        shape: its sizes.
+        dtype: "float" is the precision that all float inputs share; "int" is int32; None is anything of the library's
+            own (a table).
+        gradient: whether there is a gradient in it.
+    """
+
+    name: str
+    shape: str
+    dtype: Dtype | None = "float"
+    gradient: bool = False
+
+
+@dataclass(frozen=True)
+class Output:
+    """An array that an operator returns; see `Input`."""
+
+    name: str
+    shape: str
+    dtype: Dtype = "float"
+
+
+@dataclass(frozen=True)
+class NoOptions:
+    """The options of an operator that has none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,166 +54,86 @@ class Operator:
 
     Attributes:
         name: name under which torch knows it, `torch.ops.warpfrag.<name>`.
-        tensors: names of the array arguments, in order; any may be None in a call.
-        differentiable: those of `tensors` that have a gradient.
-        options: names of the other arguments and their types in torch's schema language.
-        outputs: names of the outputs, in order.
-        output_like: `(inputs, **options) -> [(shape, "float" | "int32"), …]`, from shapes alone.
-        forward: `(inputs, outputs, **options)`: fills the allocated outputs.
-        backward: `(inputs, grad_outputs, grad_inputs, **options)`: fills the allocated gradients that are not None;
-            a `grad_outputs` entry that is None stands for zeros.
+        inputs: the array arguments of a call.
+        outputs: what it returns.
+        forward: `(inputs, outputs, options)`: fills the allocated outputs; inputs that were not given are None.
+        backward: `(inputs, grads, targets, options)`: fills the allocated gradients `targets` of the inputs, where they
+            are not None, given those of the outputs, `grads`; one that is None stands for zeros. None: not
+            differentiable.
+        options: a frozen dataclass of numbers and texts; a method `sizes` may say what names in shapes are.
+        tables: arrays of the library's own that a call takes as well: Warp arrays whatever the kind of the inputs; they
+            have no gradient.
     """
 
     name: str
-    tensors: tuple[str, ...]
-    differentiable: tuple[str, ...]
-    outputs: tuple[str, ...]
-    output_like: Callable[..., list[tuple[Shape, str]]]
+    inputs: tuple[Input, ...]
+    outputs: tuple[Output, ...]
     forward: Callable[..., None]
-    backward: Callable[..., None]
-    options: Mapping[str, str] = field(default_factory=dict)
+    backward: Callable[..., None] | None = None
+    options: type = NoOptions
+    tables: tuple[Input, ...] = ()
 
     def __post_init__(self):
         OPERATORS[self.name] = self
+        for register in LISTENERS:
+            register(self)
+
+    @property
+    def arguments(self) -> tuple[Input, ...]:
+        """All array arguments: inputs, then tables."""
+        return (*self.inputs, *self.tables)
+
+    @property
+    def option_names(self) -> tuple[str, ...]:
+        """The names of the options, in order."""
+        return tuple(option.name for option in fields(self.options))
+
+    def output_shapes(self, arrays: SimpleNamespace, options: Any) -> list[Shape]:
+        """Return the shapes of the outputs, from those of the inputs and the options alone."""
+        sizes: dict[str, int] = dict(options.sizes()) if hasattr(options, "sizes") else {}
+        for argument in self.arguments:
+            array = getattr(arrays, argument.name)
+            if array is not None:
+                for text, size in zip(argument.shape.split(), array.shape, strict=True):
+                    name, _, more = text.partition("+")
+                    if not name.isdecimal():
+                        sizes.setdefault(name, size - int(more or 0))
+        return [
+            tuple(int(text) if text.isdecimal() else sizes[text] for text in output.shape.split())
+            for output in self.outputs
+        ]
 
 
-# Every operator by name, filled as modules define theirs; torch learns of all of them at once, when it is first used.
+# Every operator by name, and who wants to hear of further ones: array libraries that have their own registries.
 OPERATORS: dict[str, Operator] = {}
+LISTENERS: list[Callable[[Operator], None]] = []
 
 
-def kind_of(array: Any) -> Kind | None:
-    """Return which kind of array this is, or None if it is none of the three."""
-    if isinstance(array, np.ndarray):
-        return "numpy"
-    if isinstance(array, wp.array):
-        return "warp"
-    torch = sys.modules.get("torch")
-    return "torch" if torch is not None and isinstance(array, torch.Tensor) else None
+def named(names: Any, values: Any) -> SimpleNamespace:
+    """Return values under the names of inputs or outputs."""
+    return SimpleNamespace(**{each.name: value for each, value in zip(names, values, strict=True)})
 
 
-def dtype_name(array: Any) -> str:
-    """Return the name of an array's dtype, such as "float32", whatever its kind."""
-    return str(getattr(array.dtype, "__name__", array.dtype)).removeprefix("torch.")
-
-
-def common_kind(arrays: Mapping[str, Any]) -> Kind:
-    """Return the kind that all arrays (those that are not None) share.
-
-    Raises:
-        TypeError: something is no array, or two arrays are of different kinds.
-    """
-    found: dict[Kind, str] = {}
-    for name, array in arrays.items():
-        if array is None:
-            continue
-        kind = kind_of(array)
-        if kind is None:
-            raise TypeError(f"{name}: got {type(array).__name__}, expected a torch.Tensor, wp.array or NumPy array")
-        found.setdefault(kind, name)
-    if len(found) > 1:
-        (kind, name), (other, other_name) = list(found.items())[:2]
-        raise TypeError(f"{other_name}: got a {other} array, expected a {kind} array like {name}")
-    return next(iter(found))
-
-
-def apply(operator: Operator, inputs: Sequence[Any], **options: Any) -> tuple[Any, ...]:
-    """Call an operator on arrays of one kind and return its outputs in that kind.
-
-    Args:
-        operator: what to compute.
-        inputs: one array (or None) per name in `operator.tensors`, all of one kind, dtype and device.
-        options: one value per name in `operator.options`.
-    """
-    kind = common_kind(dict(zip(operator.tensors, inputs, strict=True)))
-    if kind == "torch":
-        from warpfrag.arrays import torch_ops
-
-        return torch_ops.call(operator, inputs, options)
-    if kind == "warp":
-        return _apply_warp(operator, inputs, options)
-    arrays = tuple(None if array is None else _share_numpy(array) for array in inputs)
-    outputs = _allocate(operator, arrays, options, requires_grad=False)
-    operator.forward(arrays, outputs, **options)
-    return tuple(output.numpy() for output in outputs)
-
-
-def float_type(inputs: Sequence[Any]) -> Any:
-    """Return the Warp scalar type of the floating-point arrays among the inputs."""
-    return next(a.dtype for a in inputs if a is not None and a.dtype in (wp.float32, wp.float64))
-
-
-def vectors(array: wp.array) -> wp.array:
-    """Return a Warp array of shape (n, k) as an array of n vectors, which kernels load at once; shares its memory."""
-    size, length = array.shape
-    dtype = wp.types.vector(length, array.dtype)
-    view = wp.array(ptr=array.ptr, dtype=dtype, shape=(size,), device=array.device, capacity=array.capacity)
-    # A view by address does not keep its memory alive by itself.
-    view._ref = array
-    return view
-
-
-def _allocate(operator: Operator, inputs: Sequence[Any], options: Mapping[str, Any], requires_grad: bool) -> tuple:
-    scalar = float_type(inputs)
-    device = next(a.device for a in inputs if a is not None)
-    return tuple(
-        wp.empty(shape, dtype=scalar, device=device, requires_grad=requires_grad)
-        if kind == "float"
-        else wp.empty(shape, dtype=wp.int32, device=device)
-        for shape, kind in operator.output_like(inputs, **options)
+def number_type(operator: Operator, arrays: SimpleNamespace) -> Any:
+    """Return the Warp number type of an operator's float inputs."""
+    return next(
+        getattr(arrays, each.name).dtype
+        for each in operator.inputs
+        if each.dtype == "float" and getattr(arrays, each.name) is not None
     )
 
 
-def _share_numpy(array: np.ndarray) -> wp.array:
-    return wp.array(np.ascontiguousarray(array), device="cpu", copy=False)
-
-
-def _apply_warp(operator: Operator, inputs: Sequence[Any], options: Mapping[str, Any]) -> tuple[wp.array, ...]:
-    arrays = tuple(None if array is None else array.contiguous() for array in inputs)
-    wanted = [
-        array is not None and array.requires_grad and name in operator.differentiable
-        for name, array in zip(operator.tensors, inputs, strict=True)
-    ]
-    tape = wp._src.context.runtime.tape
-    record = tape is not None and any(wanted)
-    outputs = _allocate(operator, arrays, options, requires_grad=any(wanted))
-    operator.forward(arrays, outputs, **options)
-    if record:
-
-        def backward() -> None:
-            grad_outputs = tuple(output.grad for output in outputs)
-            grads = tuple(wp.empty_like(a) if w else None for a, w in zip(arrays, wanted, strict=True))
-            operator.backward(arrays, grad_outputs, grads, **options)
-            for array, grad in zip(inputs, grads, strict=True):
-                if grad is not None:
-                    add(array.grad, grad)
-            # Consumed: left in place, a second backward pass over the tape would count them twice.
-            for grad in grad_outputs:
-                if grad is not None and grad.size:
-                    grad.zero_()
-
-        # An empty array has no gradient that a tape could keep.
-        tape.record_func(backward, [a for a in (*inputs, *outputs) if a is not None and a.requires_grad and a.size])
-    return outputs
-
-
-def add(target: wp.array, increment: wp.array) -> None:
-    """Add one array to another of the same shape, in place."""
-    if target.size == 0:
-        return
-    dense = target.contiguous()
-    inputs = [dense.flatten(), increment.flatten()]
-    wp.launch(_add[target.dtype], target.size, inputs, device=target.device, record_tape=False)
-    if dense is not target:
-        wp.copy(target, dense)
-
-
-def _add_kernel(scalar: Any) -> wp.Kernel:
-    @wp.kernel(module="unique", enable_backward=False)
-    def add_increment(target: wp.array(dtype=scalar), increment: wp.array(dtype=scalar)):
-        item = wp.tid()
-        target[item] = target[item] + increment[item]
-
-    return add_increment
-
-
-_add = {wp.float32: _add_kernel(wp.float32), wp.float64: _add_kernel(wp.float64)}
+def empty_outputs(operator: Operator, arrays: SimpleNamespace, options: Any, *, requires_grad: bool) -> SimpleNamespace:
+    """Allocate an operator's outputs for inputs that are Warp arrays."""
+    number = number_type(operator, arrays)
+    device = next(array.device for array in vars(arrays).values() if array is not None)
+    shapes = operator.output_shapes(arrays, options)
+    return named(
+        operator.outputs,
+        [
+            wp.empty(shape, dtype=number, device=device, requires_grad=requires_grad)
+            if output.dtype == "float"
+            else wp.empty(shape, dtype=wp.int32, device=device)
+            for output, shape in zip(operator.outputs, shapes, strict=True)
+        ],
+    )

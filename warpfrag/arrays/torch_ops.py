@@ -1,115 +1,186 @@
-"""Operators as torch custom operators, so that autograd and `torch.compile(fullgraph=True)` know them."""
+"""torch: operators as its custom operators, so that autograd and `torch.compile(fullgraph=True)` know them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import fields
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import torch
+import torch.autograd.forward_ad as forward_ad
 import warp as wp
 
-from warpfrag.arrays.operator import OPERATORS, Operator
+from warpfrag.arrays.kinds import Kind
+from warpfrag.arrays.operator import LISTENERS, OPERATORS, Operator, named
 
-_FLOATS = (torch.float32, torch.float64)
 _LIBRARY = "warpfrag"
+_SCHEMA_TYPES = {int: "int", float: "float", str: "str", bool: "bool"}
 
 
-def call(operator: Operator, inputs: Sequence[Any], options: Mapping[str, Any]) -> tuple[torch.Tensor, ...]:
-    """Call the torch operator that `register` made of `operator`."""
-    outputs = getattr(torch.ops.warpfrag, operator.name)(*inputs, *(options[name] for name in operator.options))
-    return outputs if isinstance(outputs, tuple) else (outputs,)
+class TorchKind(Kind):
+    """torch tensors, with autograd."""
+
+    name, type_name, xp = "torch", "torch.Tensor", torch
+
+    def owns(self, array: Any) -> bool:
+        return isinstance(array, torch.Tensor)
+
+    def to_warp(self, array: Any) -> wp.array:
+        wp.init()
+        # Detached first: for a leaf that requires a gradient, from_torch would allocate one.
+        return wp.from_torch(array.detach().contiguous())
+
+    def from_warp(self, array: wp.array) -> torch.Tensor:
+        return wp.to_torch(array)
+
+    def to_numpy(self, array: Any) -> np.ndarray:
+        return array.detach().cpu().numpy()
+
+    def astype(self, array: Any, dtype: str) -> Any:
+        return array.to(getattr(torch, dtype))
+
+    def asarray(self, values: Any, like: Any) -> Any:
+        return torch.as_tensor(np.asarray(values), dtype=like.dtype, device=like.device)
+
+    def detach(self, array: Any) -> Any:
+        return array.detach()
+
+    def records(self, arrays: Iterable[Any]) -> bool:
+        return torch.is_grad_enabled() and any(array is not None and array.requires_grad for array in arrays)
+
+    def in_order(self, array: Any) -> AbstractContextManager[Any]:
+        return _stream(array.device)
+
+    def call(self, operator: Operator, inputs: SimpleNamespace, options: Any) -> SimpleNamespace:
+        arrays = [wp.to_torch(a) if isinstance(a, wp.array) else a for a in vars(inputs).values()]
+        for each, array in zip(operator.inputs, arrays, strict=False):
+            # A custom operator would drop the tangent without a word.
+            if array is not None and forward_ad.unpack_dual(array).tangent is not None:
+                raise NotImplementedError(
+                    f"warpfrag.{operator.name}: got a forward-mode derivative in {each.name}, expected none (gradients "
+                    "are those of backward)"
+                )
+        outputs = getattr(torch.ops.warpfrag, operator.name)(
+            *arrays, *(getattr(options, name) for name in operator.option_names)
+        )
+        return named(operator.outputs, outputs if isinstance(outputs, tuple) else (outputs,))
+
+
+KIND = TorchKind()
+
+
+class _Registration:
+    """What torch is told about an operator: what it computes, its shapes, its gradient."""
+
+    def __init__(self, operator: Operator):
+        self.operator = operator
+        self.argument_count, self.output_count = len(operator.arguments), len(operator.outputs)
+
+    def schema(self) -> str:
+        """Return the arguments in torch's schema language."""
+        arrays = [f"Tensor? {each.name}" for each in self.operator.arguments]
+        options = [f"{_SCHEMA_TYPES[option.type]} {option.name}" for option in fields(self.operator.options)]  # type: ignore[index]
+        return ", ".join(arrays + options)
+
+    def split(self, arguments: Sequence[Any]) -> tuple[SimpleNamespace, Any]:
+        """Return the tensors by name, and the options."""
+        tensors = named(self.operator.arguments, arguments[: self.argument_count])
+        return tensors, self.operator.options(*arguments[self.argument_count :])
+
+    def allocate(self, *arguments: Any) -> Any:
+        """Return the outputs, not filled."""
+        tensors, options = self.split(arguments)
+        first = next(
+            t for e, t in zip(self.operator.inputs, arguments, strict=False) if e.dtype == "float" and t is not None
+        )
+        outputs = tuple(
+            first.new_empty(shape, dtype=first.dtype if output.dtype == "float" else torch.int32)
+            for output, shape in zip(self.operator.outputs, self.operator.output_shapes(tensors, options), strict=True)
+        )
+        return outputs if self.output_count > 1 else outputs[0]
+
+    def forward(self, *arguments: Any) -> Any:
+        """Return the outputs."""
+        tensors, options = self.split(arguments)
+        outputs = self.allocate(*arguments)
+        listed = outputs if self.output_count > 1 else (outputs,)
+        with _stream(listed[0].device):
+            self.operator.forward(_shared(tensors), _shared(named(self.operator.outputs, listed)), options)
+        return outputs
+
+    def allocate_grads(self, *arguments: Any) -> list[torch.Tensor]:
+        """Return the gradients that are needed, not filled: arguments are those of `backward`."""
+        needed, inputs = arguments[self.output_count], arguments[self.output_count + 1 :]
+        return [
+            torch.empty_like(tensor, memory_format=torch.contiguous_format)
+            for tensor, need in zip(inputs, needed, strict=False)
+            if need
+        ]
+
+    def backward(self, *arguments: Any) -> list[torch.Tensor]:
+        """Return the gradients that are needed, given those of the outputs, which are needed, and the inputs."""
+        grads = self.allocate_grads(*arguments)
+        tensors, options = self.split(arguments[self.output_count + 1 :])
+        filled = iter(grads)
+        targets = named(self.operator.inputs, [next(filled) if need else None for need in arguments[self.output_count]])
+        grad_outputs = named(self.operator.outputs, arguments[: self.output_count])
+        assert self.operator.backward is not None
+        with _stream(grads[0].device):
+            self.operator.backward(_shared(tensors), _shared(grad_outputs), _shared(targets), options)
+        return grads
+
+    def remember(self, ctx: Any, inputs: Sequence[Any], output: Any) -> None:
+        """Keep what the way back takes."""
+        ctx.set_materialize_grads(False)
+        ctx.options = inputs[self.argument_count :]
+        ctx.save_for_backward(*inputs[: self.argument_count])
+
+    def differentiate(self, backward_op: Any, ctx: Any, *grads: Any) -> tuple[Any, ...]:
+        """Return the gradient of every argument, None where there is none."""
+        nothing: list[Any] = [None] * (len(self.operator.tables) + len(self.operator.option_names))
+        needed = [
+            bool(need) and each.gradient for each, need in zip(self.operator.inputs, ctx.needs_input_grad, strict=False)
+        ]
+        if self.operator.backward is None or not any(needed) or all(grad is None for grad in grads):
+            return (*[None] * len(needed), *nothing)
+        found = iter(backward_op(*grads, needed, *ctx.saved_tensors, *ctx.options))
+        return (*(next(found) if need else None for need in needed), *nothing)
+
+    def refuse(self, ctx: Any, *grads: Any) -> None:
+        """Raise for a second derivative."""
+        raise NotImplementedError(
+            f"warpfrag.{self.operator.name}: second derivatives (double backward) are not supported"
+        )
 
 
 def register(operator: Operator) -> None:
     """Define `torch.ops.warpfrag.<name>` and `<name>_backward`: what they compute, their shapes, their gradient."""
-    tensor_count, output_count = len(operator.tensors), len(operator.outputs)
-    arguments_schema = ", ".join(
-        [f"Tensor? {name}" for name in operator.tensors] + [f"{kind} {name}" for name, kind in operator.options.items()]
-    )
-    grads_schema = ", ".join(f"Tensor? grad_{name}" for name in operator.outputs)
-
-    def split(arguments: Sequence[Any]) -> tuple[Sequence[Any], dict[str, Any]]:
-        return arguments[:tensor_count], dict(zip(operator.options, arguments[tensor_count:], strict=True))
-
-    def allocate(*arguments: Any) -> Any:
-        inputs, options = split(arguments)
-        first = next(t for t in inputs if t is not None and t.dtype in _FLOATS)
-        outputs = tuple(
-            first.new_empty(shape, dtype=first.dtype if kind == "float" else torch.int32)
-            for shape, kind in operator.output_like(inputs, **options)
-        )
-        return outputs if output_count > 1 else outputs[0]
-
-    def forward(*arguments: Any) -> Any:
-        inputs, options = split(arguments)
-        outputs = allocate(*arguments)
-        listed = outputs if output_count > 1 else (outputs,)
-        with _stream(listed[0].device):
-            operator.forward(_share(inputs), _share(listed), **options)
-        return outputs
-
+    told = _Registration(operator)
+    outputs = ", ".join(["Tensor"] * told.output_count)
+    grads = ", ".join(f"Tensor? grad_{each.name}" for each in operator.outputs)
     forward_op = torch.library.custom_op(
-        f"{_LIBRARY}::{operator.name}",
-        forward,
-        mutates_args=(),
-        schema=f"({arguments_schema}) -> ({', '.join(['Tensor'] * output_count)})",
+        f"{_LIBRARY}::{operator.name}", told.forward, mutates_args=(), schema=f"({told.schema()}) -> ({outputs})"
     )
-    forward_op.register_fake(allocate)
-
-    def allocate_grads(*arguments: Any) -> list[torch.Tensor]:
-        needed, inputs = arguments[output_count], arguments[output_count + 1 :]
-        return [
-            torch.empty_like(t, memory_format=torch.contiguous_format)
-            for t, need in zip(inputs[:tensor_count], needed, strict=True)
-            if need
-        ]
-
-    def backward(*arguments: Any) -> list[torch.Tensor]:
-        grads = allocate_grads(*arguments)
-        needed = arguments[output_count]
-        inputs, options = split(arguments[output_count + 1 :])
-        shared = iter(_share(grads))
-        grad_inputs = tuple(next(shared) if need else None for need in needed)
-        with _stream(grads[0].device):
-            operator.backward(_share(inputs), _share(arguments[:output_count]), grad_inputs, **options)
-        return grads
-
+    forward_op.register_fake(told.allocate)
     backward_op = torch.library.custom_op(
         f"{_LIBRARY}::{operator.name}_backward",
-        backward,
+        told.backward,
         mutates_args=(),
-        schema=f"({grads_schema}, bool[] needed, {arguments_schema}) -> Tensor[]",
+        schema=f"({grads}, bool[] needed, {told.schema()}) -> Tensor[]",
     )
-    backward_op.register_fake(allocate_grads)
-
-    def remember(ctx: Any, inputs: Sequence[Any], output: Any) -> None:
-        ctx.set_materialize_grads(False)
-        tensors, ctx.options = split(inputs)
-        ctx.save_for_backward(*tensors)
+    backward_op.register_fake(told.allocate_grads)
+    backward_op.register_autograd(told.refuse)
 
     def differentiate(ctx: Any, *grads: Any) -> tuple[Any, ...]:
-        tensors = ctx.saved_tensors
-        needed = [
-            bool(ctx.needs_input_grad[index]) and name in operator.differentiable
-            for index, name in enumerate(operator.tensors)
-        ]
-        nothing = [None] * len(operator.options)
-        if not any(needed) or all(grad is None for grad in grads):
-            return (*([None] * tensor_count), *nothing)
-        found = iter(backward_op(*grads, needed, *tensors, *ctx.options.values()))
-        return (*(next(found) if need else None for need in needed), *nothing)
+        return told.differentiate(backward_op, ctx, *grads)
 
-    forward_op.register_autograd(differentiate, setup_context=remember)
-
-    def refuse(ctx: Any, *grads: Any) -> None:
-        raise NotImplementedError(f"warpfrag.{operator.name}: second derivatives (double backward) are not supported")
-
-    backward_op.register_autograd(refuse)
+    forward_op.register_autograd(differentiate, setup_context=told.remember)
 
 
-def _share(tensors: Sequence[torch.Tensor | None]) -> tuple[wp.array | None, ...]:
-    wp.init()
-    # Detached first: for a leaf that requires a gradient, from_torch would allocate one.
-    return tuple(None if t is None else wp.from_torch(t.detach().contiguous()) for t in tensors)
+def _shared(tensors: SimpleNamespace) -> SimpleNamespace:
+    """Return tensors as Warp arrays that share their memory."""
+    return SimpleNamespace(**{name: None if t is None else KIND.to_warp(t) for name, t in vars(tensors).items()})
 
 
 def _stream(device: torch.device) -> AbstractContextManager[Any]:
@@ -120,3 +191,4 @@ def _stream(device: torch.device) -> AbstractContextManager[Any]:
 
 for _operator in OPERATORS.values():
     register(_operator)
+LISTENERS.append(register)

@@ -9,7 +9,7 @@ from typing import Any
 import warp as wp
 
 from warpfrag.arrays.launch import launch, worker_count
-from warpfrag.arrays.operator import Operator, apply, kind_of, vectors
+from warpfrag.arrays.legacy import Operator, apply, kind_of, vectors
 from warpfrag.fragments import Fragments
 from warpfrag.resolve.arguments import as_int32
 

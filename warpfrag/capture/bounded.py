@@ -14,7 +14,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 import warp as wp
 
-from warpfrag.arrays.operator import Operator, add, apply
+from warpfrag.arrays.legacy import Operator, add, apply
 from warpfrag.capture.capture import Surfaces, as_kind, check_scene, place_surfaces, to_warp
 from warpfrag.capture.into_slots import TALLY_ALL, TALLY_BEHIND, TALLY_OCCUPANCY, TALLY_ROWS, stream_triangles
 from warpfrag.capture.memory import allowed_memory, fragment_bytes, refuse, split_rows

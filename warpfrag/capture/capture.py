@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpfrag.arrays.operator import apply, kind_of
+from warpfrag.arrays.legacy import apply, kind_of
 from warpfrag.capture.memory import allowed_memory, fixed_bytes, fragment_bytes, refuse
 from warpfrag.capture.shade_adjoint import SHADE, SHADE_COVERED
 from warpfrag.fragments import Fragments

@@ -18,7 +18,7 @@ import numpy as np
 import warp as wp
 
 from warpfrag.arrays.launch import Span, launch
-from warpfrag.arrays.operator import dtype_name, kind_of, vectors
+from warpfrag.arrays.legacy import dtype_name, kind_of, vectors
 from warpfrag.capture.capture import (
     Surfaces,
     check_scene,

@@ -13,7 +13,7 @@ from typing import Any
 import warp as wp
 
 from warpfrag.arrays.launch import Span, launch
-from warpfrag.arrays.operator import vectors
+from warpfrag.arrays.legacy import vectors
 from warpfrag.capture.shade import SHADE_TENSORS, hit_weights, present, shade_color, shade_thickness
 from warpfrag.raster.ray import ZERO, Rays, centre_x, centre_y, columns_of_row, hit_depth, is_wide, load_point, stretch
 from warpfrag.raster.triangles import BAND_ROWS, Triangles, list_by_band

@@ -17,7 +17,7 @@ from typing import Any
 import warp as wp
 
 from warpfrag.arrays.launch import Span, launch
-from warpfrag.arrays.operator import vectors
+from warpfrag.arrays.legacy import vectors
 from warpfrag.capture.texture import load_rgba, load_uv, look_up, mix3, texel_between
 from warpfrag.raster.ray import (
     ONE,

@@ -17,7 +17,7 @@ from typing import Any
 import warp as wp
 
 from warpfrag.arrays.launch import Span, launch
-from warpfrag.arrays.operator import Operator, vectors
+from warpfrag.arrays.legacy import Operator, vectors
 from warpfrag.capture.fragment_adjoint import Corners, fragment_adjoint, load_triangle
 from warpfrag.capture.shade import (
     OBJECT_IN_P,

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from warpfrag.arrays.operator import kind_of
+from warpfrag.arrays.legacy import kind_of
 from warpfrag.capture.bounded import capture_kbuffer
 from warpfrag.capture.coverage import Coverage
 from warpfrag.composite import composite

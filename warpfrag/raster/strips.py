@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from warpfrag.arrays.launch import Span, launch
-from warpfrag.arrays.operator import vectors
+from warpfrag.arrays.legacy import vectors
 from warpfrag.raster.triangles import MOST_FRAGMENTS
 
 wp.set_module_options({"enable_backward": False})

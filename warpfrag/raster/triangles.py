@@ -14,7 +14,7 @@ import numpy as np
 import warp as wp
 
 from warpfrag.arrays.launch import Span, launch
-from warpfrag.arrays.operator import vectors
+from warpfrag.arrays.legacy import vectors
 from warpfrag.raster.ray import (
     Rays,
     Window,

@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from warpfrag.arrays.launch import Span, launch, worker_count
-from warpfrag.arrays.operator import dtype_name, kind_of, vectors
+from warpfrag.arrays.legacy import dtype_name, kind_of, vectors
 from warpfrag.fragments import Fragments
 from warpfrag.resolve.walk import (
     MERGE_EXACT,

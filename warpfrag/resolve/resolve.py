@@ -17,7 +17,7 @@ from typing import Any
 import warp as wp
 
 from warpfrag.arrays.launch import Span
-from warpfrag.arrays.operator import Operator, apply
+from warpfrag.arrays.legacy import Operator, apply
 from warpfrag.fragments import Fragments, Layers
 from warpfrag.resolve.arguments import (
     FRAGMENT_DIFFERENTIABLE,

@@ -14,7 +14,7 @@ import numpy as np
 import warp as wp
 
 from warpfrag.arrays.launch import Span, launch
-from warpfrag.arrays.operator import Operator, apply, dtype_name, kind_of
+from warpfrag.arrays.legacy import Operator, apply, dtype_name, kind_of
 
 wp.set_module_options({"enable_backward": False})
 

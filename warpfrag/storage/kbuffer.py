@@ -18,7 +18,7 @@ import numpy as np
 import warp as wp
 
 from warpfrag.arrays.launch import Span, launch, worker_count
-from warpfrag.arrays.operator import Operator, apply, vectors
+from warpfrag.arrays.legacy import Operator, apply, vectors
 from warpfrag.fragments import Fragments, Layers
 from warpfrag.resolve.arguments import (
     GRADIENTS,

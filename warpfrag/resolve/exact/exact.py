@@ -22,7 +22,7 @@ import numpy as np
 import warp as wp
 
 from warpfrag.arrays.launch import Span, launch, worker_count
-from warpfrag.arrays.operator import Operator, apply
+from warpfrag.arrays.legacy import Operator, apply
 from warpfrag.fragments import Fragments
 from warpfrag.resolve.arguments import (
     FRAGMENT_DIFFERENTIABLE,
