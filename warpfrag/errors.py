@@ -15,9 +15,13 @@ class SceneError(ValueError):
     """A scene file that cannot be used, in one line: file, key, what was got, what is expected."""
 
 
-def is_number(value: object) -> bool:
+def is_number(value: Any) -> bool:
     """Tell whether a value is a finite number, Python's or NumPy's, and not a boolean."""
-    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+    try:
+        return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+    # Whole numbers of hundreds of digits are beyond what a float holds.
+    except OverflowError:
+        return False
 
 
 def is_whole(value: object) -> bool:
@@ -49,7 +53,8 @@ def check_number(
 ) -> float:
     """Return a finite number from `low` to `high`, and greater than `above`, as a float."""
     expected = range_wording(low, high, above=above)
-    if not isinstance(value, Real) or isinstance(value, bool):
+    is_real = isinstance(value, Real) and not isinstance(value, bool)
+    if not is_real:
         raise TypeError(f"{name}: got {shorten(value)}, expected {expected}")
     if not (is_number(value) and low <= value <= high and (above is None or value > above)):
         raise ValueError(f"{name}: got {shorten(value)}, expected {expected}")
@@ -66,15 +71,15 @@ def check_whole(name: str, value: Any, low: float = -math.inf, high: float = mat
     return int(value)
 
 
-def check_choice(name: str, value: Any, choices: Sequence[str]) -> None:
-    """Raise unless a value is one of `choices`."""
-    if value not in choices:
+def check_choice(name: str, value: Any, choices: Sequence[str], error: type[ValueError] = ValueError) -> None:
+    """Raise `error` unless a value is one of `choices`."""
+    if not isinstance(value, str) or value not in choices:
         expected = " or ".join(f'"{choice}"' for choice in choices)
         if len(choices) > 2:
             expected = "one of " + ", ".join(f'"{choice}"' for choice in choices)
         near = suggest(value, choices) if isinstance(value, str) else ""
         hint = f" ({near})" if near.startswith("did") else ""
-        raise ValueError(f"{name}: got {shorten(value)}, expected {expected}{hint}")
+        raise error(f"{name}: got {shorten(value)}, expected {expected}{hint}")
 
 
 def suggest(word: str, choices: Iterable[str]) -> str:
@@ -91,7 +96,7 @@ def suggest(word: str, choices: Iterable[str]) -> str:
     return "known are " + ", ".join(known)
 
 
-def shorten(value: object, limit: int = 60) -> str:
+def shorten(value: Any, limit: int = 60) -> str:
     """Word a value as a file would write it, on one line and cut off when long."""
     if isinstance(value, bool):
         return "true" if value else "false"
@@ -99,8 +104,18 @@ def shorten(value: object, limit: int = 60) -> str:
         return "a table"
     if isinstance(value, (Real, str)) or value is None or isinstance(value, (list, tuple)):
         # NumPy's numbers without their types.
-        plain = value.item() if hasattr(value, "item") else value
-        text = '"' + plain.replace("\n", "\\n") + '"' if isinstance(plain, str) else " ".join(repr(plain).split())
+        given: Any = value
+        plain = given.item() if hasattr(given, "item") else given
+        # Python refuses to write whole numbers of thousands of digits.
+        if isinstance(plain, int) and abs(plain) >= 10**limit:
+            return f"a whole number of {int(plain.bit_length() * math.log10(2.0)) + 1} digits or so"
+        if isinstance(plain, str):
+            text = '"' + plain.replace("\n", "\\n").replace("\0", "\\0") + '"'
+        else:
+            try:
+                text = " ".join(repr(plain).split())
+            except (ValueError, RecursionError):
+                return f"a {type(plain).__name__} that is too long to show"
         return text if len(text) <= limit else text[: limit - 1] + "…"
     shape = getattr(value, "shape", None)
     return type(value).__name__ + ("" if shape is None else f" of shape {tuple(shape)}")
