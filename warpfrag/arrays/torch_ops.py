@@ -41,7 +41,7 @@ class TorchKind(Kind):
         return array.to(getattr(torch, dtype))
 
     def asarray(self, values: Any, like: Any) -> Any:
-        return torch.as_tensor(np.asarray(values), dtype=like.dtype, device=like.device)
+        return torch.as_tensor(values, dtype=like.dtype, device=like.device)
 
     def detach(self, array: Any) -> Any:
         return array.detach()

@@ -1,4 +1,4 @@
-"""Mesh files into one ``Mesh`` each: ply, obj, stl, off, glb and gltf here, usd in its own file.
+"""Mesh files into one `Mesh` each: ply, obj, stl, off, glb and gltf here, usd in its own file.
 
 All parts of a file become one mesh, with the transforms of its scene graph. What the parts look like is kept: colour
 factors and vertex colours as colour per vertex (or one, where all agree), every image as an image of its own with an
@@ -20,20 +20,20 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from warpfrag.colors import linear_image, srgb_to_linear
+from warpfrag.colors import srgb_to_linear
 from warpfrag.errors import suggest
-from warpfrag.shapes.mesh import Mesh, smooth_normals, split_faces, transformed_normals, weld
+from warpfrag.files.pixels import of_pillow, with_opacity
+from warpfrag.shapes.mesh import Mesh, join, split_faces, transformed_normals, weld
 
 TRIMESH_SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb", ".gltf")
 USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
-GREY = 0.8
 
 
 def load_mesh(path: str | os.PathLike, root: str | os.PathLike | None = None) -> Mesh:
     """Read a mesh file.
 
     Args:
-        path: A file with one of the suffixes above, or ``"warp:<name>"`` for an asset of the Warp wheel.
+        path: A file with one of the suffixes above, or `"warp:<name>"` for an asset of the Warp wheel.
         root: Folder outside of which nothing is read for this mesh (materials, buffers, images, references); default
             the file's own folder.
 
@@ -49,10 +49,10 @@ def load_mesh(path: str | os.PathLike, root: str | os.PathLike | None = None) ->
     suffix = path.suffix.lower()
     if suffix not in TRIMESH_SUFFIXES + USD_SUFFIXES:
         expected = ", ".join(TRIMESH_SUFFIXES + USD_SUFFIXES)
-        raise ValueError(f"found the mesh file {path} of an unknown kind, expected one of {expected}")
+        raise ValueError(f"got the mesh file {path} of an unknown kind, expected one of {expected}")
     if not path.is_file():
-        found = "a folder" if path.is_dir() else "no such file"
-        raise ValueError(f"found {found} at {path}{_near(path)}, expected a mesh file")
+        got = "a folder" if path.is_dir() else "no such file"
+        raise ValueError(f"got {got} at {path}{_near(path)}, expected a mesh file")
     if suffix in USD_SUFFIXES:
         from warpfrag.files.usd import load_usd
 
@@ -60,12 +60,12 @@ def load_mesh(path: str | os.PathLike, root: str | os.PathLike | None = None) ->
     else:
         parts, holds = _load_trimesh(path, root)
     if not parts:
-        raise ValueError(f"found no faces in {path}{holds}, expected a mesh with triangles")
+        raise ValueError(f"got no faces in {path}{holds}, expected a mesh with triangles")
     return join(parts)
 
 
 def warp_asset(name: str) -> Path:
-    """Return where ``"warp:<file>"`` lies among the example assets of the Warp wheel.
+    """Return where `"warp:<file>"` lies among the example assets of the Warp wheel.
 
     Raises:
         ValueError: There is no such asset.
@@ -76,62 +76,8 @@ def warp_asset(name: str) -> Path:
     stem = name.removeprefix("warp:")
     if stem not in names:
         meshes = [entry for entry in names if entry.endswith(TRIMESH_SUFFIXES + USD_SUFFIXES)]
-        raise ValueError(f'found no "{stem}" among the assets of Warp; {suggest(stem, meshes)}')
+        raise ValueError(f'got no "{stem}" among the assets of Warp; {suggest(stem, meshes)}')
     return folder / stem
-
-
-def join(parts: list[Mesh]) -> Mesh:
-    """Put parts after one another in one mesh; parts without a colour are grey, or white under an image."""
-    if len(parts) == 1:
-        return parts[0]
-    counts = [len(part.vertices) for part in parts]
-    first = np.cumsum([0, *counts])
-    textures: list[np.ndarray] = []
-    place: dict[int, int] = {}
-    indices = []
-    for part in parts:
-        for image in part.textures:
-            if id(image) not in place:
-                place[id(image)] = len(textures)
-                textures.append(image)
-        index = part.texture_index
-        if index is None:
-            index = np.full(len(part.faces), 0 if part.textures else -1)
-        places = np.array([place[id(image)] for image in part.textures] or [-1])
-        indices.append(np.where(index < 0, -1, places[np.maximum(index, 0)]).astype(np.int32))
-    color: Any = None
-    opacity: Any = None
-    normals = uv = None
-    if any(part.color is not None for part in parts):
-        colors = [_known_color(part) for part in parts]
-        color = colors[0]
-        if any(other.ndim > 1 or not np.array_equal(other, color) for other in colors):
-            color = np.concatenate([np.broadcast_to(c, (n, 3)) for c, n in zip(colors, counts, strict=True)])
-    if any(part.opacity is not None for part in parts):
-        opacities = [np.asarray(1.0 if part.opacity is None else part.opacity) for part in parts]
-        opacity = float(opacities[0]) if opacities[0].ndim == 0 else opacities[0]
-        if any(other.ndim > 0 or other != opacity for other in opacities):
-            opacity = np.concatenate([np.broadcast_to(o, (n,)) for o, n in zip(opacities, counts, strict=True)])
-    if any(part.normals is not None for part in parts):
-        own = [smooth_normals(part.vertices, part.faces) if part.normals is None else part.normals for part in parts]
-        normals = np.concatenate(own)
-    if textures:
-        blank = [np.zeros((n, 2), dtype=np.float32) for n in counts]
-        uv = np.concatenate([zero if part.uv is None else part.uv for part, zero in zip(parts, blank, strict=True)])
-    return Mesh(
-        np.concatenate([part.vertices for part in parts]),
-        np.concatenate([part.faces + np.int32(start) for part, start in zip(parts, first, strict=False)]),
-        normals,
-        color,
-        opacity,
-        uv,
-        textures,
-        np.concatenate(indices) if textures else None,
-    )
-
-
-def _known_color(part: Mesh) -> np.ndarray:
-    return np.full(3, 1.0 if part.textures else GREY) if part.color is None else np.asarray(part.color)
 
 
 def _near(path: Path) -> str:
@@ -165,7 +111,7 @@ def _load_trimesh(path: Path, root: Path) -> tuple[list[Mesh], str]:
         because = str(error).strip().splitlines()
         reason = f" ({because[0][:120]})" if because else f" ({type(error).__name__})"
         raise ValueError(
-            f"found a {suffix[1:]} file that cannot be read: {path}{reason}{resolver.complaint()}"
+            f"got a {suffix[1:]} file that cannot be read: {path}{reason}{resolver.complaint()}"
         ) from error
     if resolver.complaint():
         warnings.warn(f"{path}{resolver.complaint()}", stacklevel=4)
@@ -247,7 +193,7 @@ def _with_material(mesh: Mesh, visual: Any, linear: bool, factors: list, images:
         return _replaced(mesh, color=color, opacity=opacity)
     key = id(image), mode, cutoff, alpha if mode == "MASK" else 1.0
     if key not in images:
-        pixels = linear_image(image)
+        pixels = with_opacity(of_pillow(image, managed=False))
         if mode == "OPAQUE":
             pixels[..., 3] = 1.0
         elif mode == "MASK":

@@ -1,7 +1,7 @@
 """USD files (usd, usda, usdc, usdz) through usd-core.
 
 Every visible mesh of the stage, instances included, with its world transform at the earliest time. Units and the up
-axis stay as the file has them: a file with z up stays so (turn it with ``rotate``). Polygons become fans of triangles;
+axis stay as the file has them: a file with z up stays so (turn it with `rotate`). Polygons become fans of triangles;
 subdivision surfaces are their control mesh. Colour and opacity are displayColor and displayOpacity (linear), else the
 constants of a bound UsdPreviewSurface; its textures are not read.
 """
@@ -16,13 +16,13 @@ from warpfrag.shapes.mesh import Mesh, transformed_normals
 
 
 def load_usd(path: Path, root: Path) -> tuple[list[Mesh], str]:
-    """Read the meshes of a stage; see ``load_mesh``.
+    """Read the meshes of a stage; see `load_mesh`.
 
     Returns:
         The meshes, and words about what else the stage holds when there are none.
 
     Raises:
-        ValueError: The file cannot be read, or it refers to a file outside of ``root``.
+        ValueError: the file cannot be read, or it refers to a file outside of `root`.
         ImportError: usd-core is not installed.
     """
     need("pxr", "usd", "Reading USD files")
@@ -32,11 +32,11 @@ def load_usd(path: Path, root: Path) -> tuple[list[Mesh], str]:
         stage = Usd.Stage.Open(str(path))
     except Tf.ErrorException as error:
         reason = str(error).strip().splitlines()[-1].strip()[:120]
-        raise ValueError(f"found a USD file that cannot be read: {path} ({reason})") from error
+        raise ValueError(f"got a USD file that cannot be read: {path} ({reason})") from error
     for layer in stage.GetUsedLayers():
         used = layer.realPath.split("[")[0]
         if used and Path(used).resolve() != path.resolve() and not Path(used).resolve().is_relative_to(root.resolve()):
-            raise ValueError(f"found a reference to {used} in {path}, expected references inside {root}")
+            raise ValueError(f"got a reference to {used} in {path}, expected references inside {root}")
     time = Usd.TimeCode.EarliestTime()
     transforms = UsdGeom.XformCache(time)
     parts, kinds = [], set()
@@ -63,7 +63,7 @@ def _mesh(prim: Any, matrix: np.ndarray, time: Any) -> Mesh | None:
     indices = np.asarray(mesh.GetFaceVertexIndicesAttr().Get(time), dtype=np.int64)
     if points.ndim != 2 or counts.ndim != 1 or indices.ndim != 1 or not len(counts):
         return None
-    where = f"found a USD mesh that cannot be read: {prim.GetPath()}"
+    where = f"got a USD mesh that cannot be read: {prim.GetPath()}"
     if counts.min() < 0 or counts.sum() != len(indices):
         raise ValueError(f"{where} (its faces need {counts.sum()} indices, it has {len(indices)})")
     if len(indices) and (indices.min() < 0 or indices.max() >= len(points)):
@@ -116,11 +116,11 @@ def _vertices(
     """Bring values of any interpolation to vertices; a point becomes several vertices only where its values differ.
 
     Args:
-        attributes: Values (or None) and USD interpolation, by name.
-        face_of: Polygon of each triangle.
-        corner: Places of the triangles' corners in the list of polygon corners, (3T,).
-        indices: Point of each polygon corner.
-        point_count: Number of points.
+        attributes: values (or None) and USD interpolation, by name.
+        face_of: polygon of each triangle.
+        corner: places of the triangles' corners in the list of polygon corners, (3T,).
+        indices: point of each polygon corner.
+        point_count: number of points.
 
     Returns:
         The point of each vertex, the vertex of each triangle corner (3T,), and each attribute per vertex (or one

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from tied import Tied
 
-from warpfrag.files.images import linear_to_srgb
+from warpfrag.colors import linear_to_srgb
 from warpfrag.fit.losses import psnr
 from warpfrag.resolve.arguments import Merge
 
