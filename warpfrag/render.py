@@ -17,8 +17,9 @@ from warpfrag.errors import check_choice
 from warpfrag.fragments import Fragments
 from warpfrag.raster.ray import Window
 from warpfrag.raster.triangles import RasterTriangles
-from warpfrag.resolve.arguments import Merge, Mix, check_options
+from warpfrag.resolve.options import check_options
 from warpfrag.scene.camera import Camera
+from warpfrag.scene.names import Merge, Mix
 from warpfrag.scene.scene import Scene
 from warpfrag.storage.into_slots import check_kbuffer
 from warpfrag.storage.kbuffer import kbuffer

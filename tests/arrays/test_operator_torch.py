@@ -10,10 +10,10 @@ import torch
 import warp as wp
 from fragment_arrays import array_of, fragments_of
 from pixels import generic_pixels, random_pixels
+from warpfrag.resolve.arguments import Walk
 
 import warpfrag as wf
 from warpfrag import Fragments
-from warpfrag.resolve.arguments import Walk
 
 PIXELS = generic_pixels(4, 6, 6, opaque=True)
 OPACITY_SUM = np.linspace(1.0, 2.0, len(PIXELS.depth)) * PIXELS.rgba[:, 3]

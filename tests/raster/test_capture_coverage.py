@@ -8,7 +8,7 @@ import warp as wp
 from capture_scenes import orthographic, perspective, pixels_of, quad, rays_through, scene, soup, surface
 from scipy.spatial import Delaunay
 
-from warpfrag.capture.capture import capture
+from warpfrag.capture.coverage import capture
 from warpfrag.raster.ray import Window
 from warpfrag.raster.triangles import count_fragments, prepare_triangles, scan_counts, sort_fragments, store_fragments
 from warpfrag.shapes.primitives import sphere, torus

@@ -54,7 +54,7 @@ _VECTORS = ("points", "rgba", "corners", "objects", "uv", "texels", "textures")
 
 
 def surface_arrays(arrays: Mapping[str, Any], window: Window) -> Any:
-    """Return surfaces as kernels take them: Warp arrays by the names of `SurfaceArrays`; None or missing stays empty."""
+    """Return surfaces, Warp arrays by the names of `SurfaceArrays`, as kernels take them; None stays empty."""
     structure = SurfaceArrays[arrays["points"].dtype]
     surface = structure()
     surface.rays = window.rays()

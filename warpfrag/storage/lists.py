@@ -8,8 +8,10 @@ from typing import Any
 
 import warp as wp
 
-from warpfrag.arrays.launch import Span, launch
-from warpfrag.arrays.precisions import Array, Number, in_precisions, kernels
+from warpfrag.arrays.launch import launch
+from warpfrag.arrays.precisions import Array, Number, in_precisions
+from warpfrag.arrays.sorting import shell_sort
+from warpfrag.raster.cover import each_pixel
 from warpfrag.storage.method import PixelLists, Room, Stage, Storage, scan_counts
 
 wp.set_module_options({"enable_backward": False})
@@ -19,12 +21,13 @@ INDEX_BYTES = 4
 
 @in_precisions
 class ListArrays:
-    """Where each pixel's next fragment goes, (P,), and the fragments: what they are, and their depths, if kept."""
+    """Where each pixel's next fragment goes, (P,); `PixelLists`; and 0."""
 
     following: Array[wp.int32]
     offsets: Array[wp.int32]
     items: Array[wp.int32]
     depths: Array[Number]
+    zero: Number
 
 
 @wp.func(inline=True)
@@ -58,61 +61,46 @@ def _collect(arrays: Any, room: Room) -> PixelLists:
 DYNAMIC = Storage("dfb", ListArrays, _allocate, (Stage(store),), _collect, counted=True)
 
 
-@wp.func
-def precedes(depth: Any, item: int, other_depth: Any, other_item: int):
-    """Tell whether a fragment comes before another, by depth, then by submission."""
+@wp.func(inline=True)
+def depth_of(lists: Any, at: int, item: int):
+    """Return the depth that lies beside an item; 0 without depths."""
+    depth = lists.zero
+    if lists.depths.shape[0] > 0:
+        depth = lists.depths[at]
+    return depth
+
+
+@wp.func(inline=True)
+def precedes(lists: Any, item: int, depth: Any, other_at: int, other: int):
+    """Tell whether a fragment comes before another: by depth, then by submission."""
+    other_depth = depth_of(lists, other_at, other)
     if depth != other_depth:
         return depth < other_depth
-    return item < other_item
+    return item < other
 
 
-@kernels
-def sort_pixels(number: Any) -> Any:
-    """Return the kernel that sorts the fragments of pixels."""
+@wp.func(inline=True)
+def move_depth(lists: Any, source: int, target: int):
+    """Move a depth with its item."""
+    if lists.depths.shape[0] > 0:
+        lists.depths[target] = lists.depths[source]
 
-    def kernel(span: Span, offsets: wp.array(dtype=int), items: wp.array(dtype=int), depths: wp.array(dtype=number)):
-        """Sort each pixel's fragments.
 
-        Args:
-            span: the pixels.
-            offsets: see `PixelLists`, (P + 1,).
-            items: output, (F,).
-            depths: output, (F,), or empty: then items are sorted as numbers.
-        """
-        by_depth = depths.shape[0] > 0
-        for pixel in range(span.begin + wp.tid(), span.end, span.stride):
-            begin = offsets[pixel]
-            count = offsets[pixel + 1] - begin
-            # Shell's sort with Knuth's gaps (1, 4, 13, ...); short lists start at gap 1, an insertion sort.
-            gap = int(1)
-            while 9 * gap < count:
-                gap = 3 * gap + 1
-            while gap > 0:
-                for i in range(gap, count):
-                    face = items[begin + i]
-                    depth = number(0.0)
-                    other_depth = number(0.0)
-                    if by_depth:
-                        depth = depths[begin + i]
-                    j = int(i)
-                    moving = bool(True)
-                    while moving and j >= gap:
-                        other = begin + j - gap
-                        if by_depth:
-                            other_depth = depths[other]
-                        moving = precedes(depth, face, other_depth, items[other])
-                        if moving:
-                            items[begin + j] = items[other]
-                            if by_depth:
-                                depths[begin + j] = other_depth
-                            j -= gap
-                    if j != i:
-                        items[begin + j] = face
-                        if by_depth:
-                            depths[begin + j] = depth
-                gap = gap // 3
+@wp.func(inline=True)
+def store_depth(lists: Any, at: int, depth: Any):
+    """Put a depth beside its item."""
+    if lists.depths.shape[0] > 0:
+        lists.depths[at] = depth
 
-    return kernel
+
+_sort = shell_sort(depth_of, precedes, move_depth, store_depth)
+
+
+@wp.func(inline=True)
+def sort_pixel(storage: Any, worker: int, pixel: int):
+    """Sort the fragments of a pixel."""
+    begin = storage.offsets[pixel]
+    _sort(storage, storage.items, begin, storage.offsets[pixel + 1] - begin)
 
 
 def sort_lists(lists: PixelLists) -> None:
@@ -120,5 +108,6 @@ def sort_lists(lists: PixelLists) -> None:
     count, device = lists.items.shape[0], lists.items.device
     if count == 0 or (lists.depths.shape[0] == 0 and lists.as_submitted):
         return
-    inputs = [lists.offsets, lists.items, lists.depths]
-    launch(sort_pixels(lists.depths.dtype), lists.offsets.shape[0] - 1, inputs, device)
+    arrays = ListArrays[lists.depths.dtype]()
+    arrays.offsets, arrays.items, arrays.depths = lists.offsets, lists.items, lists.depths
+    launch(each_pixel(arrays._cls, sort_pixel), lists.offsets.shape[0] - 1, [arrays], device)
