@@ -31,6 +31,9 @@ from warpfrag.slabs.lists import NO_FRAGMENT, FragmentGradients, FragmentLists, 
 
 wp.set_module_options({"enable_backward": False})
 
+# A resolved layer's opacity may be above 1 by rounding.
+MOST_OPACITY = wp.constant(1.0 + 1e-5)
+
 IMAGE_OUTPUT = (Output("image", "P 4"),)
 
 
@@ -62,7 +65,7 @@ def composite_layers_fwd(number: Any) -> Any:
                 own = rgba[pixel, layer]
                 # Zero times everything: one NaN or infinity makes the sum NaN.
                 nothing = number(0.0) * (own[0] + own[1] + own[2])
-                if not (nothing == number(0.0) and own[3] >= number(0.0) and own[3] <= number(1.0)):
+                if not (nothing == number(0.0) and own[3] >= number(0.0) and own[3] <= number(MOST_OPACITY)):
                     wp.atomic_min(invalid, span.worker, 0, pixel)
                 color += through * vec3(own[0], own[1], own[2])
                 through *= number(1.0) - own[3]

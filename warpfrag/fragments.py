@@ -255,8 +255,8 @@ def pixel_number(pixel: Any, shape: tuple[int, ...]) -> int:
     Raises:
         ValueError: it lies outside the grid.
     """
-    place = pixel if isinstance(pixel, (tuple, list)) else (pixel,)
-    limits = shape if len(place) == len(shape) else (math.prod(shape),)
+    several = isinstance(pixel, (tuple, list))
+    place, limits = (tuple(pixel), shape) if several else ((pixel,), (math.prod(shape),))
     whole = all(isinstance(each, (int, np.integer)) and not isinstance(each, bool) for each in place)
     if len(place) != len(limits) or not whole or not all(0 <= a < b for a, b in zip(place, limits, strict=True)):
         raise ValueError(f"pixel: got {shorten(pixel)}, expected a place in the grid of {_size_words(shape)} pixels")
