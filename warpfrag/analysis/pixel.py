@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from warpfrag.analysis.absorbance import Absorbance, absorbance, fragments_of_pixel
-from warpfrag.capture.capture import capture
+from warpfrag.capture.coverage import capture
 from warpfrag.colors import linear_to_srgb
 from warpfrag.extras import need
 from warpfrag.files.saving import replacing

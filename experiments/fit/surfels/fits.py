@@ -5,11 +5,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from discs import Discs
+from warpfrag.resolve.arguments import Merge
 
 import warpfrag as wf
 from warpfrag.fit import FitParameter, FitResult, Study, View
 from warpfrag.fit.losses import psnr
-from warpfrag.resolve.arguments import Merge
 from warpfrag.scene.scene import Scene
 
 OPAQUE, FALLOFF = "opaque", "falloff"

@@ -18,13 +18,13 @@ from cloud import load_bunny, render_mesh, sample_points, write_points  # noqa: 
 from discs import Discs  # noqa: E402
 from fits import FALLOFF, OPAQUE, PAPER, RADIUS, Row, Setting, images_of, mean_psnr, reference_of  # noqa: E402
 from tied import Tied, fit_tied  # noqa: E402
+from warpfrag.resolve.arguments import Merge  # noqa: E402
 
 import warpfrag as wf  # noqa: E402
 from warpfrag.capture.coverage import Coverage  # noqa: E402
 from warpfrag.files.images import write_image  # noqa: E402
 from warpfrag.fit import Progress, Reference, load_study  # noqa: E402
 from warpfrag.fit.losses import psnr  # noqa: E402
-from warpfrag.resolve.arguments import Merge  # noqa: E402
 from warpfrag.shapes.mesh import Mesh  # noqa: E402
 from warpfrag.studies.summary import Figure, Summary, Table  # noqa: E402
 
