@@ -24,7 +24,8 @@ from warpfrag.render import render
 from warpfrag.resolve.resolve import resolve
 from warpfrag.scene.camera import Camera
 from warpfrag.scene.depth_resolution import z_resolution
-from warpfrag.scene.scene import Scene, SceneObject
+from warpfrag.scene.scene import Scene
+from warpfrag.scene.surface import SceneObject
 from warpfrag.storage.kbuffer import kbuffer
 
 __version__ = "0.1.0"

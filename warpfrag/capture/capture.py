@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpfrag.arrays.legacy import apply, kind_of
+from warpfrag.arrays.legacy import apply, dtype_name, kind_of
 from warpfrag.capture.memory import allowed_memory, fixed_bytes, fragment_bytes, refuse
 from warpfrag.capture.shade_adjoint import SHADE, SHADE_COVERED
 from warpfrag.fragments import Fragments
@@ -88,7 +88,7 @@ def place_surfaces(geometry: Geometry, camera: Camera) -> Surfaces:
         texels = np.concatenate([image.reshape(-1, 4) for image in geometry.textures]).astype(np.float32)
         tables[2:] = geometry.uv, geometry.texture_id, texels, np.column_stack([begins, sizes]).astype(np.int32)
     return Surfaces(
-        points=to_camera_space(geometry.vertices, camera, geometry.camera_pose),
+        points=to_camera_space(geometry.vertices, camera, geometry.camera_pose, geometry.precision),
         rgba=geometry.rgba,
         thickness=geometry.thickness,
         maps=maps,
@@ -97,7 +97,9 @@ def place_surfaces(geometry: Geometry, camera: Camera) -> Surfaces:
     )
 
 
-def to_camera_space(vertices: Any, camera: Camera, pose: tuple[Any, Any] | None = None) -> Any:
+def to_camera_space(
+    vertices: Any, camera: Camera, pose: tuple[Any, Any] | None = None, precision: str | None = None
+) -> Any:
     """Return world vertices in camera space, computed in float64 whatever their precision; differentiable in torch.
 
     Component by component, so that NumPy and torch round alike.
@@ -106,6 +108,7 @@ def to_camera_space(vertices: Any, camera: Camera, pose: tuple[Any, Any] | None 
         vertices: world space [scene units], (V, 3), NumPy or torch.
         camera: where from.
         pose: translation and rotation of the camera in its own axes, see `warpfrag.scene.pose`; None where it stays.
+        precision: of the result; None takes that of the vertices.
     """
     view = camera.view_matrix()
     xp = _namespace(vertices)
@@ -115,7 +118,8 @@ def to_camera_space(vertices: Any, camera: Camera, pose: tuple[Any, Any] | None 
     rows = [[float(value) for value in row] for row in view[:3]]
     coordinates = [row[0] * x + row[1] * y + row[2] * z + row[3] for row in rows]
     points = xp.stack(coordinates if pose is None else move_camera(coordinates, *pose), 1)
-    return points.astype(vertices.dtype) if xp is np else points.to(vertices.dtype)
+    precision = precision or dtype_name(vertices)
+    return points.astype(precision) if xp is np else points.to(getattr(xp, precision))
 
 
 def count_within(surfaces: Surfaces, window: Window, memory_limit: float | None) -> tuple[Triangles, wp.array, int]:

@@ -19,7 +19,8 @@ import typer
 
 if TYPE_CHECKING:
     from warpfrag.fit.session import Progress
-    from warpfrag.scene.scene import Scene, SceneObject
+    from warpfrag.scene.scene import Scene
+    from warpfrag.scene.surface import SceneObject
 
 app = typer.Typer(
     add_completion=False,
@@ -347,7 +348,7 @@ def _background(text: str) -> tuple[float, ...]:
 
 
 def _with_thickness(item: "SceneObject", option: str, text: str) -> "SceneObject":
-    from warpfrag.scene.scene import multiple_of_p
+    from warpfrag.scene.parameters import multiple_of_p
 
     multiple = multiple_of_p(text)
     if multiple is not None:
@@ -367,7 +368,8 @@ def _set(scene: "Scene", setting: str) -> "Scene":
     """Return the scene with one parameter set as `NAME=VALUE` says."""
     from warpfrag.colors import parse_hex
     from warpfrag.errors import suggest
-    from warpfrag.scene.pose import POSE_KEYS, posed
+    from warpfrag.scene.names import POSE_KEYS
+    from warpfrag.scene.pose import posed
 
     name, equals, text = setting.partition("=")
     name, text = name.strip(), text.strip()

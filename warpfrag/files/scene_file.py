@@ -32,8 +32,10 @@ from warpfrag.errors import SceneError, shorten
 from warpfrag.files.meshes import GREY, load_mesh, warp_asset
 from warpfrag.files.table import Table, is_number, is_numbers, number_words, read_toml
 from warpfrag.scene.camera import Camera
-from warpfrag.scene.pose import CAMERA
-from warpfrag.scene.scene import MERGES, MIXES, Scene, SceneObject, multiple_of_p
+from warpfrag.scene.names import CAMERA, MERGES, MIXES
+from warpfrag.scene.parameters import multiple_of_p
+from warpfrag.scene.scene import Scene
+from warpfrag.scene.surface import SceneObject
 from warpfrag.shapes import primitives
 from warpfrag.shapes.mesh import Mesh, lambert, smooth_normals, split_faces, transformed_normals
 from warpfrag.shapes.surfels import load_points, surfels

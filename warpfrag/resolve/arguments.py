@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import numpy as np
 import warp as wp
@@ -23,11 +23,9 @@ from warpfrag.resolve.walk import (
     Scratch32,
     Scratch64,
 )
+from warpfrag.scene.names import Merge, Mix
 from warpfrag.slabs.operators import MIX_AVERAGE, MIX_OPACITY, MIX_OPTICAL_DEPTH
 from warpfrag.slabs.slab import LOG_FLOOR, LOG_OPAQUE, Slab32, Slab64
-
-Merge = Literal["none", "smooth", "order_independent", "exact"]
-Mix = Literal["opacity", "average", "optical_depth"]
 
 MERGES = {
     "none": MERGE_NONE,
