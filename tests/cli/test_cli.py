@@ -96,27 +96,27 @@ MISTAKES = [
     (["render", "scene.toml", "-o", "a.jpg"], "a.jpg: found the suffix .jpg"),
     (["render", "scene.toml", "-o", "no/a.png"], "found no folder no"),
     (["render", "scene.toml", "-o", "a.png", "--bits", "12"], "bits: found 12"),
-    (["render", "scene.toml", "-o", "a.png", "--beta", "2"], "beta: found 2"),
+    (["render", "scene.toml", "-o", "a.png", "--beta", "2"], "beta: got 2"),
     (["render", "scene.toml", "-o", "a.png", "--beta", "x"], "--beta"),
     (["render", "scene.toml", "-o", "a.png", "--size", "12"], "--size: found '12'"),
-    (["render", "scene.toml", "-o", "a.png", "--merge", "smoth"], "merge: found"),
-    (["render", "scene.toml", "-o", "a.png", "--layers", "0"], "layers: found 0"),
+    (["render", "scene.toml", "-o", "a.png", "--merge", "smoth"], "merge: got"),
+    (["render", "scene.toml", "-o", "a.png", "--layers", "0"], "layers: got 0"),
     (["render", "scene.toml", "-o", "a.png", "--thickness", "2Q"], "--thickness: found '2Q'"),
-    (["render", "scene.toml", "-o", "a.png", "--thickness", "-1"], "thickness: found -1"),
+    (["render", "scene.toml", "-o", "a.png", "--thickness", "-1"], "thickness: got -1"),
     (["render", "scene.toml", "-o", "a.png", "--background", "red"], "--background: found 'red'"),
     (["render", "scene.toml", "-o", "a.png", "--set", "beta"], "expected NAME=VALUE"),
     (["render", "scene.toml", "-o", "a.png", "--set", "bal.opacity=1"], 'did you mean "ball.opacity"?'),
-    (["render", "scene.toml", "-o", "a.png", "--set", "ball.opacity=2"], "ball.opacity: found 2"),
+    (["render", "scene.toml", "-o", "a.png", "--set", "ball.opacity=2"], "ball.opacity: got 2"),
     (["render", "scene.toml", "-o", "a.png", "--set", "ball.rotation=1,2"], "expected x,y,z"),
-    (["render", "scene.toml", "-o", "a.png", "--set", "camera.rotation=0,nan,0"], "expected 3 finite numbers"),
+    (["render", "scene.toml", "-o", "a.png", "--set", "camera.rotation=0,nan,0"], "expected numbers that are finite"),
     (["fit", "none.toml"], "none.toml: found no such file"),
-    (["fit", "study.toml", "--steps", "0"], "steps: found 0"),
-    (["fit", "study.toml", "--resume"], "found no checkpoint to resume"),
+    (["fit", "study.toml", "--steps", "0"], "steps: got 0"),
+    (["fit", "study.toml", "--resume"], "got no checkpoint to resume"),
     (["fit"], "fit: found neither STUDY nor --all"),
     (["fit", "study.toml", "--all"], "fit: found both STUDY and --all"),
     (["fit", "study.toml", "--from", "."], "--from: found it without --all"),
-    (["fit", "--all"], "experiments/fit: found no such folder"),
-    (["fit", "--all", "--from", "."], "found no study, expected folders with a study.py"),
+    (["fit", "--all"], "experiments/fit: got no such folder"),
+    (["fit", "--all", "--from", "."], "got no study, expected folders with a study.py"),
     (["fit", "--all", "--size", "8x8"], "--size: found it with --all"),
     (["fit", ".", "--resume"], "--resume: found it with ., expected it with a study file only"),
     (["fit", "."], "found no study.py in it"),
@@ -280,17 +280,17 @@ def test_fit_all_runs_every_study(folder, capsys):
     assert told == [
         "warpfrag: failing: ValueError: found 3, expected 4 (more in results/fit/failing/log.txt)",
         "warpfrag: killed: study.py was ended by SIGKILL (more in results/fit/killed/log.txt)",
-        "warpfrag: silent: found no new results/fit/silent/summary.json, expected study.py to save a Summary"
+        "warpfrag: silent: got no new results/fit/silent/summary.json, expected study.py to save a Summary"
         " (more in results/fit/silent/log.txt)",
     ]
     assert (folder / "results" / "fit" / "good" / "log.txt").read_text() == "measuring\n"
     assert "It is 1.5." in (studies / "good" / "README.md").read_text()
     text = (folder / "results" / "fit" / "report.html").read_text()
-    assert re.findall(r"ValueError: found 3, expected 4|ended by SIGKILL|found no new results|It is 1.5", text) == [
+    assert re.findall(r"ValueError: found 3, expected 4|ended by SIGKILL|got no new results|It is 1.5", text) == [
         "ValueError: found 3, expected 4",
         "It is 1.5",
         "ended by SIGKILL",
-        "found no new results",
+        "got no new results",
         "It is 1.5",
     ]
 
@@ -316,7 +316,7 @@ def test_old_summary_does_not_count(folder, capsys):
     assert main(["fit", "brief"]) == 0
     (folder / "brief" / "study.py").write_text("")
     assert main(["fit", "brief"]) == 1
-    assert "found no new" in capsys.readouterr().err
+    assert "got no new" in capsys.readouterr().err
 
 
 def test_module_is_the_command_line(folder):

@@ -132,8 +132,7 @@ def test_camera_moves_as_the_scene_does_the_other_way():
     np.testing.assert_allclose(ahead.depth, capture(scene(perspective((16, 12)), quad(1.0, 0.5))).depth)
     vertices = np.asarray(setting.objects[0].vertices, np.float64)
     right = depths(**{"camera.translation": np.array([0.25, 0.125, 0.0])})
-    # NumPy's vertices say nothing of the image's precision.
-    moved = depths(**{"quad.vertices": vertices - [0.25, 0.125, 0.0], "beta": np.array(1.0)})
+    moved = depths(**{"quad.vertices": vertices - [0.25, 0.125, 0.0]})
     np.testing.assert_array_equal(right.offsets, moved.offsets)
     np.testing.assert_array_equal(right.depth, moved.depth)
     # About the axis that points down, positive is to the right.

@@ -98,9 +98,9 @@ class Frame:
         if len(devices) > 1:
             (device, name), (other, other_name) = list(devices.items())[:2]
             raise ValueError(f"parameters: got {name} on {device} and {other_name} on {other}, expected one device")
-        # NumPy's vertices say where things stand, which is kept in float64 anyway, and nothing of the image.
         asking = [*arrays.values()]
-        asking += [v for n, v in overrides.items() if isinstance(v, np.ndarray) and known[n].kind is not VERTICES]
+        # Vertices that an object keeps in float64 say where it stands (far away), and nothing of the image.
+        asking += [v for n, v in overrides.items() if isinstance(v, np.ndarray) and not known[n].keeps_float64]
         precision: Precision = "float64" if any(dtype_name(value) == "float64" for value in asking) else "float32"
         kind = kind_of(next(iter(arrays.values()))) if arrays else NUMPY
         assert kind is not None
@@ -133,7 +133,8 @@ def assemble(scene: Scene, parameters: Mapping[str, Any] | None = None, *, camer
 
     Returns:
         Arrays as torch tensors, differentiable in the overrides, if any override is a tensor, else NumPy. The image is
-        float64 if any override is a float64 tensor, or a float64 NumPy array of anything but vertices; else float32.
+        float64 if any override is a float64 tensor or NumPy array, else float32; NumPy's vertices of an object that
+        keeps its own in float64 have no say in that.
 
     Raises:
         ValueError: an unknown name, a wrong shape, a value out of range, or tensors on different devices.

@@ -193,12 +193,14 @@ class Parameter:
         kind: what it is.
         owner: the name of its object, "camera", or empty for the scene's.
         vertex_count: vertices of its object; 0 for others.
+        keeps_float64: whether its owner keeps it in double precision.
     """
 
     name: str
     kind: ParameterKind
     owner: str = ""
     vertex_count: int = 0
+    keeps_float64: bool = False
 
     def shapes(self, grid: Shape, view_count: int = 1) -> dict[Per, Shape]:
         """Return the shapes of values by what they are per; those of several views are stacked.
@@ -251,7 +253,13 @@ def describe(objects: Iterable[HasVertices]) -> dict[str, Parameter]:
     found = [Parameter(kind.key, kind) for kind in SCENE_KINDS]
     for kinds in (OBJECT_KINDS, OBJECT_MOTIONS):
         found += [
-            Parameter(f"{item.name}.{kind.key}", kind, item.name, len(item.vertices))
+            Parameter(
+                f"{item.name}.{kind.key}",
+                kind,
+                item.name,
+                len(item.vertices),
+                kind is VERTICES and item.vertices.dtype == np.float64,
+            )
             for item in objects
             for kind in kinds
         ]
