@@ -219,9 +219,9 @@ class _Transformed(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Any) -> Any:
-        told = _REGISTERED.get(ctx.name)
-        if told is None:
+        if ctx.name not in _REGISTERED:
             _REGISTERED[ctx.name.removesuffix("_backward")].refuse(ctx)
+        told = _REGISTERED[ctx.name]
 
         def backward_op(*arguments: Any) -> Any:
             found = _Transformed.apply(f"{ctx.name}_backward", *arguments)
