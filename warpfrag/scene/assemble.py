@@ -16,10 +16,20 @@ from typing import Any, Literal
 import numpy as np
 
 from warpfrag.arrays.kinds import NUMPY, Kind, dtype_name, kind_of
-from warpfrag.errors import shorten
+from warpfrag.errors import check_choice, shorten
 from warpfrag.scene.camera import Camera
 from warpfrag.scene.names import CAMERA, POSE_KEYS
-from warpfrag.scene.parameters import COLOR, COMMON_THICKNESS, OPACITY, THICKNESS, VERTICES, Parameter, check_name
+from warpfrag.scene.parameters import (
+    BOUNDS,
+    COLOR,
+    COMMON_THICKNESS,
+    OPACITY,
+    THICKNESS,
+    VERTICES,
+    Bounds,
+    Parameter,
+    check_name,
+)
 from warpfrag.scene.pose import move_object
 from warpfrag.scene.scene import Scene
 from warpfrag.scene.surface import SceneObject
@@ -120,7 +130,13 @@ class Frame:
         return self.kind.asarray(np.asarray(value, np.float64), self.kind.astype(self.like, "float64"))
 
 
-def assemble(scene: Scene, parameters: Mapping[str, Any] | None = None, *, camera: Camera | None = None) -> Geometry:
+def assemble(
+    scene: Scene,
+    parameters: Mapping[str, Any] | None = None,
+    *,
+    camera: Camera | None = None,
+    bounds: Bounds = "clamp",
+) -> Geometry:
     """Flatten a scene, with parameter overrides applied.
 
     Args:
@@ -130,6 +146,8 @@ def assemble(scene: Scene, parameters: Mapping[str, Any] | None = None, *, camer
             map. `"thickness"` without a name, one number or a map, is that of all objects without one of their own
             here. `"beta"` is let through.
         camera: whose pixel grid thickness maps must have; default the scene's.
+        bounds: what becomes of parameters out of their range: "clamp" puts them on its end, with a gradient that leads
+            back in but not farther out; "error" refuses them.
 
     Returns:
         Arrays as torch tensors, differentiable in the overrides, if any override is a tensor, else NumPy. The image is
@@ -144,14 +162,16 @@ def assemble(scene: Scene, parameters: Mapping[str, Any] | None = None, *, camer
         >>> assemble(scene, {"ball.opacity": 0.5}).rgba[0]
         array([0.8, 0.8, 0.8, 0.5], dtype=float32)
     """
+    check_choice("bounds", bounds, BOUNDS)
     camera = camera or scene.camera
     known = scene.described()
     scene, overrides = _checked(scene, parameters or {}, known)
     frame = Frame.of(overrides, known)
     if COMMON_THICKNESS.key in overrides:
         # One array for all: a map is then there once.
-        common = overrides[COMMON_THICKNESS.key] = frame.array(overrides[COMMON_THICKNESS.key])
+        common = known[COMMON_THICKNESS.key].bounded(frame.array(overrides[COMMON_THICKNESS.key]), bounds)
         known[COMMON_THICKNESS.key].check(common, camera.shape)
+        overrides[COMMON_THICKNESS.key] = common
     vertices, rgba, thickness, faces, uv, texture_id = [], [], [], [], [], []
     textures: list[np.ndarray] = []
     thickness_maps: dict[int, Any] = {}
@@ -159,7 +179,7 @@ def assemble(scene: Scene, parameters: Mapping[str, Any] | None = None, *, camer
     textured = any(item.texture is not None for item in scene.objects)
     xp = frame.kind.xp
     for index, item in enumerate(scene.objects):
-        values = _values(item, overrides, known, frame, camera)
+        values = _values(item, overrides, known, frame, camera, bounds)
         count = len(item.vertices)
         vertices.append(world_vertices_of(values[VERTICES], item, _pose(item.name, overrides, known, frame), frame))
         color = xp.broadcast_to(values[COLOR], (count, 3))
@@ -212,7 +232,12 @@ def world_vertices_of(own: Any, item: SceneObject, pose: tuple[Any, Any] | None,
 
 
 def _values(
-    item: SceneObject, overrides: Mapping[str, Any], known: Mapping[str, Parameter], frame: Frame, camera: Camera
+    item: SceneObject,
+    overrides: Mapping[str, Any],
+    known: Mapping[str, Parameter],
+    frame: Frame,
+    camera: Camera,
+    bounds: Bounds,
 ) -> dict[Any, Any]:
     """Return an object's values by kind, checked: those given, or its own."""
     values = {}
@@ -222,7 +247,8 @@ def _values(
         if kind is THICKNESS:
             own = overrides.get(COMMON_THICKNESS.key, own)
         given = overrides.get(name, own)
-        values[kind] = frame.double(given) if kind is VERTICES else frame.array(given)
+        value = frame.double(given) if kind is VERTICES else frame.array(given)
+        values[kind] = known[name].bounded(value, bounds) if name in overrides else value
         known[name].check(values[kind], camera.shape)
     return values
 

@@ -17,6 +17,9 @@ from warpfrag.colors import parse_hex
 from warpfrag.errors import range_wording, shorten, suggest
 from warpfrag.scene.names import CAMERA, ThicknessUnit
 
+# What becomes of a value outside its range: it is put on the end of the range, or refused.
+Bounds = Literal["clamp", "error"]
+BOUNDS: tuple[Bounds, ...] = get_args(Bounds)
 Per = Literal["object", "vertex", "pixel", "view"]
 PER: tuple[Per, ...] = get_args(Per)
 Shape = tuple[int, ...]
@@ -78,6 +81,11 @@ class ParameterKind:
     def __reduce__(self) -> Any:
         # There is one of each: a copy is the kind itself.
         return _find_kind, (self.owner, self.key)
+
+    @property
+    def is_bounded(self) -> bool:
+        """Whether some numbers are out of its range."""
+        return self.low > -math.inf or self.high < math.inf
 
     @property
     def range_wording(self) -> str:
@@ -217,6 +225,16 @@ class Parameter:
             "view": (view_count, *value),
         }
         return {per: shapes[per] for per in self.kind.per}
+
+    def bounded(self, value: Any, bounds: Bounds) -> Any:
+        """Return a value, clamped to its range if that is what `bounds` says; see `Kind.clip` for its gradient.
+
+        Infinities stay what they are, to be refused.
+        """
+        kind = kind_of(value) or NUMPY
+        if bounds != "clamp" or not self.kind.is_bounded or not bool(kind.xp.isfinite(kind.detach(value)).all()):
+            return value
+        return kind.clip(value, self.kind.low, self.kind.high)
 
     def check(self, value: Any, grid: Shape | None = None) -> None:
         """Check shape, range and finiteness of a value.
