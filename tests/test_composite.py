@@ -67,7 +67,7 @@ def test_options_go_with_fragments_only():
     """Layers have been merged before: every option is refused by name."""
     layers = layers_of(np.zeros((1, 1, 1, 4)), [[1]])
     for name, value in {"beta": 0.5, "max_layers": 2, "merge": "smooth", "mix": "opacity"}.items():
-        with pytest.raises(TypeError, match=f"{name}: goes with Fragments only"):
+        with pytest.raises(TypeError, match=f"{name}: got it with Layers, expected Fragments"):
             wf.composite(layers, **{name: value})
     with pytest.raises(TypeError, match="ndarray"):
         wf.composite(layers.rgba)

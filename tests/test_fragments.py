@@ -108,7 +108,7 @@ def test_devices_must_be_the_same():
     """Torch's "meta" device stands in for a second one."""
     arrays = valid()
     tensors = {name: torch.from_numpy(arrays[name]) for name in ("rgba", "depth", "thickness", "offsets")}
-    with pytest.raises(ValueError, match="thickness: is on meta, expected cpu like rgba"):
+    with pytest.raises(ValueError, match="thickness: got it on meta, expected cpu like rgba"):
         Fragments(**(tensors | {"thickness": tensors["thickness"].to("meta")}), shape=(1, 2))
 
 

@@ -9,7 +9,7 @@ from capture_scenes import orthographic, perspective, quad, scene, soup, surface
 
 from warpfrag import render as render_module
 from warpfrag.capture import memory
-from warpfrag.capture.capture import capture
+from warpfrag.capture.coverage import capture
 from warpfrag.composite import composite
 from warpfrag.files.scene_file import load_scene
 from warpfrag.render import render

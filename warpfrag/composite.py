@@ -10,363 +10,279 @@ so opaque layers have exact gradients. Everything is differentiable; the fused v
 """
 
 import math
-from collections.abc import Sequence
-from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
 
-from warpfrag.arrays.launch import Span, launch
-from warpfrag.arrays.legacy import Operator, apply, vectors
+from warpfrag.arrays.apply import apply
+from warpfrag.arrays.kinds import as_vectors
+from warpfrag.arrays.launch import Span, launch, worker_count
+from warpfrag.arrays.operator import Input, Operator, Output
+from warpfrag.arrays.precisions import kernels
 from warpfrag.fragments import Fragments, Layers
-from warpfrag.resolve.arguments import (
-    FRAGMENT_DIFFERENTIABLE,
-    FRAGMENT_TENSORS,
-    GRADIENTS,
-    MERGE_OPTIONS,
-    PIXELS,
-    SCRATCH,
-    Merge,
-    Mix,
-    Walk,
-    as_int32,
-    check_options,
-    fragment_inputs,
-)
-from warpfrag.resolve.exact.exact import COMPOSITE_EXACT, apply_exact
-from warpfrag.resolve.walk import (
-    STEP_START,
-    choose_step,
-    load_slab,
-    pixel_beta,
-    replay,
-    sort_pixel,
-    step_powers,
-    store_grad,
-    take_step,
-    take_step_adjoint,
-    valid_beta,
-    valid_fragment,
-    zero_slab,
-)
+from warpfrag.resolve.exact.exact import ExactOptions, exact_backward, exact_forward, exact_inputs
+from warpfrag.resolve.options import MERGE_INPUTS, MergeOptions, as_int32, check_options, merge_inputs
+from warpfrag.resolve.pixel import Replay, pixel_beta, sort_pixel, valid_beta
+from warpfrag.resolve.sinks import IMAGE, ImageArrays
+from warpfrag.resolve.walk import ingredients, resolve_bwd, resolve_fwd, walk_backward, walk_forward
+from warpfrag.scene.names import Merge, Mix
+from warpfrag.slabs.lists import NO_FRAGMENT, FragmentGradients, FragmentLists, no_invalid, valid_fragment
 
 wp.set_module_options({"enable_backward": False})
 
+# A resolved layer's opacity may be above 1 by rounding.
+MOST_OPACITY = wp.constant(1.0 + 1e-5)
 
-@cache
-def _layers_forward_kernel(scalar: Any) -> wp.Kernel:
-    @wp.kernel(module="unique", enable_backward=False)
-    def composite_layers_fwd(
+IMAGE_OUTPUT = (Output("image", "P 4"),)
+
+
+@kernels
+def composite_layers_fwd(number: Any) -> Any:
+    """Return the kernel that composites layers."""
+    vec3, vec4 = wp.types.vector(3, number), wp.types.vector(4, number)
+
+    def kernel(
         span: Span,
-        rgba: wp.array3d(dtype=scalar),
+        rgba: wp.array2d(dtype=vec4),
         count: wp.array(dtype=int),
-        image: wp.array2d(dtype=scalar),
+        invalid: wp.array2d(dtype=int),
+        image: wp.array(dtype=vec4),
     ):
+        """Composite layers.
+
+        Args:
+            span: pixels.
+            rgba: the layers, (P, M).
+            count: how many of them each pixel has, (P,).
+            invalid: output: by thread the lowest pixel with values out of range, (threads, 2).
+            image: output, (P,).
+        """
         for pixel in range(span.begin + wp.tid(), span.end, span.stride):
-            transmittance = scalar(1.0)
-            red = scalar(0.0)
-            green = scalar(0.0)
-            blue = scalar(0.0)
+            through = number(1.0)
+            color = vec3()
             for layer in range(wp.clamp(count[pixel], 0, rgba.shape[1])):
-                red += transmittance * rgba[pixel, layer, 0]
-                green += transmittance * rgba[pixel, layer, 1]
-                blue += transmittance * rgba[pixel, layer, 2]
-                transmittance *= scalar(1.0) - rgba[pixel, layer, 3]
-            image[pixel, 0] = red
-            image[pixel, 1] = green
-            image[pixel, 2] = blue
-            image[pixel, 3] = scalar(1.0) - transmittance
+                own = rgba[pixel, layer]
+                # Zero times everything: one NaN or infinity makes the sum NaN.
+                nothing = number(0.0) * (own[0] + own[1] + own[2])
+                if not (nothing == number(0.0) and own[3] >= number(0.0) and own[3] <= number(MOST_OPACITY)):
+                    wp.atomic_min(invalid, span.worker, 0, pixel)
+                color += through * vec3(own[0], own[1], own[2])
+                through *= number(1.0) - own[3]
+            image[pixel] = vec4(color[0], color[1], color[2], number(1.0) - through)
 
-    return composite_layers_fwd
+    return kernel
 
 
-@cache
-def _layers_backward_kernel(scalar: Any) -> wp.Kernel:
-    vec3 = wp.types.vector(3, scalar)
+@kernels
+def composite_layers_bwd(number: Any) -> Any:
+    """Return the kernel of the gradient of composited layers."""
+    vec3, vec4 = wp.types.vector(3, number), wp.types.vector(4, number)
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def composite_layers_bwd(
+    def kernel(
         span: Span,
-        rgba: wp.array3d(dtype=scalar),
+        rgba: wp.array2d(dtype=vec4),
         count: wp.array(dtype=int),
-        grad_image: wp.array2d(dtype=scalar),
-        grad_rgba: wp.array3d(dtype=scalar),
+        grad_image: wp.array(dtype=vec4),
+        grad_rgba: wp.array2d(dtype=vec4),
     ):
+        """Take the gradient of an image back to its layers.
+
+        Args:
+            span: pixels.
+            rgba: the layers, (P, M).
+            count: how many of them each pixel has, (P,).
+            grad_image: gradient of the image, (P,).
+            grad_rgba: output: gradient of the layers, (P, M).
+        """
         for pixel in range(span.begin + wp.tid(), span.end, span.stride):
             layer_count = wp.clamp(count[pixel], 0, rgba.shape[1])
             # The transmittance up to each layer waits where its opacity's gradient will be.
-            transmittance = scalar(1.0)
+            through = number(1.0)
             for layer in range(rgba.shape[1]):
-                grad_rgba[pixel, layer, 3] = wp.where(layer < layer_count, transmittance, scalar(0.0))
-                transmittance *= scalar(1.0) - rgba[pixel, layer, 3]
-            g = vec3(grad_image[pixel, 0], grad_image[pixel, 1], grad_image[pixel, 2])
+                seen = wp.where(layer < layer_count, through, number(0.0))
+                grad_rgba[pixel, layer] = vec4(seen, seen, seen, seen)
+                through *= number(1.0) - rgba[pixel, layer][3]
+            g = grad_image[pixel]
             behind = vec3()
-            transmittance_behind = scalar(1.0)
+            through_behind = number(1.0)
             for back in range(rgba.shape[1]):
                 layer = rgba.shape[1] - 1 - back
-                t = grad_rgba[pixel, layer, 3]
-                grad_rgba[pixel, layer, 0] = t * g[0]
-                grad_rgba[pixel, layer, 1] = t * g[1]
-                grad_rgba[pixel, layer, 2] = t * g[2]
-                grad_rgba[pixel, layer, 3] = t * (grad_image[pixel, 3] * transmittance_behind - wp.dot(g, behind))
+                t = grad_rgba[pixel, layer][3]
+                g_opacity = t * (g[3] * through_behind - wp.dot(vec3(g[0], g[1], g[2]), behind))
+                grad_rgba[pixel, layer] = vec4(t * g[0], t * g[1], t * g[2], g_opacity)
                 if layer < layer_count:
-                    through = scalar(1.0) - rgba[pixel, layer, 3]
-                    color = vec3(rgba[pixel, layer, 0], rgba[pixel, layer, 1], rgba[pixel, layer, 2])
-                    behind = color + through * behind
-                    transmittance_behind *= through
+                    own = rgba[pixel, layer]
+                    behind = vec3(own[0], own[1], own[2]) + (number(1.0) - own[3]) * behind
+                    through_behind *= number(1.0) - own[3]
 
-    return composite_layers_bwd
-
-
-def _layers_output_like(inputs: Sequence[Any]) -> list[tuple[tuple[int, ...], str]]:
-    return [((inputs[0].shape[0], 4), "float")]
+    return kernel
 
 
-def _layers_forward(inputs: Sequence[Any], outputs: Sequence[Any]) -> None:
-    rgba = inputs[0]
-    launch(_layers_forward_kernel(rgba.dtype), rgba.shape[0], [*inputs, *outputs], rgba.device)
+def _layers_forward(inputs: SimpleNamespace, outputs: SimpleNamespace, options: Any) -> None:
+    rgba, device = inputs.rgba, inputs.rgba.device
+    rows = worker_count(rgba.shape[0], device, 0)
+    invalid = no_invalid(rows, device)
+    arguments = [as_vectors(rgba), inputs.count, invalid, as_vectors(outputs.image)]
+    launch(composite_layers_fwd(rgba.dtype), rgba.shape[0], arguments, device, rows)
+    pixel = int(invalid.numpy()[:, 0].min())
+    if pixel != NO_FRAGMENT:
+        found = rgba.numpy()[pixel, : int(inputs.count.numpy()[pixel])].tolist()
+        raise ValueError(f"layers: got rgba {found} in pixel {pixel}, expected finite values, opacity from 0 to 1")
 
 
-def _layers_backward(inputs: Sequence[Any], grad_outputs: Sequence[Any], grad_inputs: Sequence[Any]) -> None:
-    rgba = inputs[0]
-    kernel = _layers_backward_kernel(rgba.dtype)
-    launch(kernel, rgba.shape[0], [*inputs, grad_outputs[0], grad_inputs[0]], rgba.device)
+def _layers_backward(inputs: SimpleNamespace, grads: SimpleNamespace, targets: SimpleNamespace, options: Any) -> None:
+    rgba = inputs.rgba
+    arguments = [as_vectors(rgba), inputs.count, as_vectors(grads.image), as_vectors(targets.rgba)]
+    launch(composite_layers_bwd(rgba.dtype), rgba.shape[0], arguments, rgba.device)
 
 
-_COMPOSITE_LAYERS = Operator(
-    name="composite_layers",
-    tensors=("rgba", "count"),
-    differentiable=("rgba",),
-    outputs=("image",),
-    output_like=_layers_output_like,
-    forward=_layers_forward,
-    backward=_layers_backward,
+COMPOSITE_LAYERS = Operator(
+    "composite_layers",
+    (Input("rgba", "P M 4", gradient=True), Input("count", "P", "int")),
+    IMAGE_OUTPUT,
+    _layers_forward,
+    _layers_backward,
 )
 
 
-@cache
-def _fragments_forward_kernel(scalar: Any, merge_kind: int, mix: int) -> wp.Kernel:
-    vec3 = wp.types.vector(3, scalar)
-    vec4 = wp.types.vector(4, scalar)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def composite_fragments_fwd(
-        span: Span,
-        pixels: PIXELS[scalar],
-        order: wp.array(dtype=int),
-        length: int,
-        invalid: wp.array2d(dtype=int),
-        image: wp.array(dtype=vec4),
-    ):
-        base = (span.worker + wp.tid()) * length
-        for pixel in range(span.begin + wp.tid(), span.end, span.stride):
-            begin = pixels.offsets[pixel]
-            count = pixels.offsets[pixel + 1] - begin
-            beta = pixel_beta(pixels, pixel)
-            if not valid_beta(pixels, pixel):
-                wp.atomic_min(invalid, span.worker, 1, pixel)
-            sort_pixel(pixels, begin, count, order, base)
-            running = zero_slab(scalar(0.0))
-            running.t = scalar(1.0)
-            color = vec3()
-            through = scalar(1.0)
-            layer = int(0)
-            for position in range(count):
-                fragment = order[base + position]
-                if not valid_fragment(pixels, fragment):
-                    wp.atomic_min(invalid, span.worker, 0, fragment)
-                following = load_slab(pixels, fragment, merge_kind)
-                step = int(STEP_START)
-                if position > 0:
-                    step = choose_step(running, following, layer, pixels.max_layers, merge_kind)
-                if step == STEP_START:
-                    color += through * running.c
-                    through *= running.t
-                    layer += wp.where(position > 0, 1, 0)
-                    running = following
-                else:
-                    front, back = step_powers(step, running, following, merge_kind, pixels.floor)
-                    running = take_step(step, running, following, beta, front, back, merge_kind, mix)
-            color += through * running.c
-            image[pixel] = vec4(color[0], color[1], color[2], scalar(1.0) - through * running.t)
-
-    return composite_fragments_fwd
-
-
-@cache
-def _fragments_backward_kernel(scalar: Any, merge_kind: int, mix: int) -> wp.Kernel:
-    vec3 = wp.types.vector(3, scalar)
-    vec4 = wp.types.vector(4, scalar)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def composite_fragments_bwd(
-        span: Span,
-        pixels: PIXELS[scalar],
-        scratch: SCRATCH[scalar],
-        grad_image: wp.array(dtype=vec4),
-        grads: GRADIENTS[scalar],
-    ):
-        base = (span.worker + wp.tid()) * scratch.length
-        for pixel in range(span.begin + wp.tid(), span.end, span.stride):
-            count = pixels.offsets[pixel + 1] - pixels.offsets[pixel]
-            beta = pixel_beta(pixels, pixel)
-            replay(pixels, pixel, merge_kind, mix, scratch, base)
-            g_color = vec3(grad_image[pixel][0], grad_image[pixel][1], grad_image[pixel][2])
-            g_opacity = grad_image[pixel][3]
-            behind = vec3()
-            through_behind = scalar(1.0)
-            g = zero_slab(scalar(0.0))
-            g_beta = scalar(0.0)
-            ends_layer = bool(True)
-            for back in range(count):
-                at = base + count - 1 - back
-                step = scratch.step[at]
-                if ends_layer:
-                    layer = scratch.running[at]
-                    through = scratch.through[at]
-                    g = zero_slab(scalar(0.0))
-                    g.c = through * g_color
-                    g.t = through * (wp.dot(g_color, behind) - g_opacity * through_behind)
-                    behind = layer.c + layer.t * behind
-                    through_behind *= layer.t
-                ends_layer = step == STEP_START
-                g_fragment = g
-                if step != STEP_START:
-                    g_running, g_following, g_step = take_step_adjoint(
-                        step,
-                        g,
-                        scratch.running[at - 1],
-                        scratch.fragment[at],
-                        beta,
-                        scratch.front[at],
-                        scratch.back[at],
-                        merge_kind,
-                        mix,
-                        pixels.floor,
-                    )
-                    g = g_running
-                    g_fragment = g_following
-                    g_beta += g_step
-                store_grad(g_fragment, pixels, scratch.order[at], grads)
-            if grads.beta.shape[0] > 0:
-                grads.beta[pixel] = g_beta
-
-    return composite_fragments_bwd
-
-
-@cache
-def _over_forward_kernel(scalar: Any, merge_kind: int, mix: int) -> wp.Kernel:
+@kernels
+def composite_over_fwd(number: Any) -> Any:
     """Return the kernel for fragments that do not merge: over is associative, so layers and tail make no difference."""
-    vec3 = wp.types.vector(3, scalar)
-    vec4 = wp.types.vector(4, scalar)
+    vec3, vec4 = wp.types.vector(3, number), wp.types.vector(4, number)
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def composite_over_fwd(
+    def kernel(
         span: Span,
-        pixels: PIXELS[scalar],
+        lists: FragmentLists[number],
         order: wp.array(dtype=int),
         length: int,
         invalid: wp.array2d(dtype=int),
-        image: wp.array(dtype=vec4),
+        out: ImageArrays[number],
     ):
+        """Composite fragments; see `resolve_fwd`.
+
+        Args:
+            span: pixels.
+            lists: their fragments.
+            order: scratch memory, `length` for each thread.
+            length: of a thread's row.
+            invalid: output: what `no_invalid` says, (threads, 2).
+            out: output: the image.
+        """
         base = (span.worker + wp.tid()) * length
         for pixel in range(span.begin + wp.tid(), span.end, span.stride):
-            begin = pixels.offsets[pixel]
-            count = pixels.offsets[pixel + 1] - begin
-            if not valid_beta(pixels, pixel):
+            begin = lists.offsets[pixel]
+            count = lists.offsets[pixel + 1] - begin
+            if not valid_beta(pixel_beta(lists, pixel)):
                 wp.atomic_min(invalid, span.worker, 1, pixel)
-            sort_pixel(pixels, begin, count, order, base)
+            sort_pixel(lists, begin, count, order, base)
             color = vec3()
-            through = scalar(1.0)
+            through = number(1.0)
             for position in range(count):
                 fragment = order[base + position]
-                if not valid_fragment(pixels, fragment):
+                if not valid_fragment(lists, fragment):
                     wp.atomic_min(invalid, span.worker, 0, fragment)
-                rgba = pixels.rgba[fragment]
+                rgba = lists.rgba[fragment]
                 color += through * vec3(rgba[0], rgba[1], rgba[2])
-                through *= scalar(1.0) - rgba[3]
-            image[pixel] = vec4(color[0], color[1], color[2], scalar(1.0) - through)
+                through *= number(1.0) - rgba[3]
+            out.image[pixel] = vec4(color[0], color[1], color[2], number(1.0) - through)
 
-    return composite_over_fwd
+    return kernel
 
 
-@cache
-def _over_backward_kernel(scalar: Any, merge_kind: int, mix: int) -> wp.Kernel:
-    vec3 = wp.types.vector(3, scalar)
-    vec4 = wp.types.vector(4, scalar)
+@kernels
+def composite_over_bwd(number: Any) -> Any:
+    """Return the kernel of the gradient of fragments that do not merge."""
+    vec3, vec4 = wp.types.vector(3, number), wp.types.vector(4, number)
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def composite_over_bwd(
+    def kernel(
         span: Span,
-        pixels: PIXELS[scalar],
-        scratch: SCRATCH[scalar],
-        grad_image: wp.array(dtype=vec4),
-        grads: GRADIENTS[scalar],
+        lists: FragmentLists[number],
+        scratch: Replay[number],
+        grad_out: ImageArrays[number],
+        grads: FragmentGradients[number],
     ):
+        """Take the gradient back through pixels; see `resolve_bwd`.
+
+        Args:
+            span: pixels.
+            lists: their fragments.
+            scratch: scratch memory, a row for each thread.
+            grad_out: gradient of the image.
+            grads: output: gradients of the fragments, and of beta by pixel, (P,).
+        """
         base = (span.worker + wp.tid()) * scratch.length
         for pixel in range(span.begin + wp.tid(), span.end, span.stride):
-            begin = pixels.offsets[pixel]
-            count = pixels.offsets[pixel + 1] - begin
-            sort_pixel(pixels, begin, count, scratch.order, base)
-            through = scalar(1.0)
+            begin = lists.offsets[pixel]
+            count = lists.offsets[pixel + 1] - begin
+            sort_pixel(lists, begin, count, scratch.order, base)
+            through = number(1.0)
             for position in range(count):
                 scratch.through[base + position] = through
-                through *= scalar(1.0) - pixels.rgba[scratch.order[base + position]][3]
-            g = grad_image[pixel]
+                through *= number(1.0) - lists.rgba[scratch.order[base + position]][3]
+            g = grad_out.image[pixel]
             g_color = vec3(g[0], g[1], g[2])
             behind = vec3()
-            through_behind = scalar(1.0)
+            through_behind = number(1.0)
             for back in range(count):
                 at = base + count - 1 - back
                 fragment = scratch.order[at]
-                rgba = pixels.rgba[fragment]
+                rgba = lists.rgba[fragment]
                 t = scratch.through[at]
                 if grads.rgba.shape[0] > 0:
                     g_opacity = t * (g[3] * through_behind - wp.dot(g_color, behind))
                     grads.rgba[fragment] = vec4(t * g[0], t * g[1], t * g[2], g_opacity)
-                behind = vec3(rgba[0], rgba[1], rgba[2]) + (scalar(1.0) - rgba[3]) * behind
-                through_behind *= scalar(1.0) - rgba[3]
+                behind = vec3(rgba[0], rgba[1], rgba[2]) + (number(1.0) - rgba[3]) * behind
+                through_behind *= number(1.0) - rgba[3]
                 # Nothing else plays a part in over.
                 if grads.depth.shape[0] > 0:
-                    grads.depth[fragment] = scalar(0.0)
+                    grads.depth[fragment] = number(0.0)
                 if grads.thickness.shape[0] > 0:
-                    grads.thickness[fragment] = scalar(0.0)
+                    grads.thickness[fragment] = number(0.0)
                 if grads.opacity_sum.shape[0] > 0:
-                    grads.opacity_sum[fragment] = scalar(0.0)
+                    grads.opacity_sum[fragment] = number(0.0)
             if grads.beta.shape[0] > 0:
-                grads.beta[pixel] = scalar(0.0)
+                grads.beta[pixel] = number(0.0)
 
-    return composite_over_bwd
-
-
-def _fragments_output_like(
-    inputs: Sequence[Any], max_layers: int, merge: str, mix: str
-) -> list[tuple[tuple[int, ...], str]]:
-    return [((inputs[3].shape[0] - 1, 4), "float")]
+    return kernel
 
 
-def _fragments_forward(inputs: Sequence[Any], outputs: Sequence[Any], **options: Any) -> None:
-    kernel = _over_forward_kernel if options["merge"] == "none" else _fragments_forward_kernel
-    Walk(inputs, **options).forward(kernel, [vectors(outputs[0])])
+def _fragments_forward(inputs: SimpleNamespace, outputs: SimpleNamespace, options: MergeOptions) -> None:
+    number = inputs.rgba.dtype
+    over = options.merge == "none"
+    kernel = composite_over_fwd(number) if over else resolve_fwd(*ingredients(inputs, options), IMAGE)
+    walk_forward(kernel, inputs, options, IMAGE.fill(outputs, number))
 
 
 def _fragments_backward(
-    inputs: Sequence[Any], grad_outputs: Sequence[Any], grad_inputs: Sequence[Any], **options: Any
+    inputs: SimpleNamespace, grads: SimpleNamespace, targets: SimpleNamespace, options: MergeOptions
 ) -> None:
-    kernel = _over_backward_kernel if options["merge"] == "none" else _fragments_backward_kernel
-    Walk(inputs, **options).backward(kernel, [vectors(grad_outputs[0])], grad_inputs)
+    number = inputs.rgba.dtype
+    over = options.merge == "none"
+    kernel = composite_over_bwd(number) if over else resolve_bwd(*ingredients(inputs, options), IMAGE)
+    walk_backward(kernel, inputs, options, IMAGE.fill(grads, number), targets)
 
 
-_COMPOSITE_FRAGMENTS = Operator(
-    name="composite_fragments",
-    tensors=FRAGMENT_TENSORS,
-    differentiable=FRAGMENT_DIFFERENTIABLE,
-    outputs=("image",),
-    output_like=_fragments_output_like,
-    forward=_fragments_forward,
-    backward=_fragments_backward,
-    options=MERGE_OPTIONS,
-)
+COMPOSITE = Operator("composite", MERGE_INPUTS, IMAGE_OUTPUT, _fragments_forward, _fragments_backward, MergeOptions)
+
+
+def _as_layer(image: wp.array) -> SimpleNamespace:
+    """Return an image as the only layer of M = 1: over is associative."""
+    rgba = image.reshape((image.shape[0], 1, 4))
+    return SimpleNamespace(rgba=rgba, depth=None, thickness=None, opacity_sum=None, count=None)
+
+
+def _exact_forward(inputs: SimpleNamespace, outputs: SimpleNamespace, options: ExactOptions) -> None:
+    exact_forward(inputs, _as_layer(outputs.image), options)
+
+
+def _exact_backward(
+    inputs: SimpleNamespace, grads: SimpleNamespace, targets: SimpleNamespace, options: ExactOptions
+) -> None:
+    exact_backward(inputs, _as_layer(grads.image), targets, options)
+
+
+COMPOSITE_EXACT = Operator("composite_exact", MERGE_INPUTS, IMAGE_OUTPUT, _exact_forward, _exact_backward, ExactOptions)
 
 
 def composite(
@@ -395,22 +311,28 @@ def composite(
     Raises:
         TypeError: an argument is of the wrong type, or options were given together with layers.
         ValueError: an option does not exist, or values are not finite or out of range.
+
+    Example:
+        >>> fragments = wf.capture(wf.load_scene("scenes/three_spheres.toml"))
+        >>> wf.composite(fragments, beta=0.5, max_layers=4).shape
+        (512, 512, 4)
     """
     given = {"beta": beta, "max_layers": max_layers, "merge": merge, "mix": mix}
     if isinstance(source, Layers):
         for name, value in given.items():
             if value is not None:
-                raise TypeError(f"{name}: goes with Fragments only, the layers of {type(source).__name__} are merged")
+                raise TypeError(f"{name}: got it with Layers, expected Fragments (layers are merged already)")
         pixel_count = math.prod(source.shape)
         rgba = source.rgba.reshape((pixel_count, source.max_layers, 4))
-        (image,) = apply(_COMPOSITE_LAYERS, (rgba, as_int32(source.count).reshape((pixel_count,))))
-        return image.reshape((*source.shape, 4))
-    defaults: dict[str, Any] = {"beta": 1.0, "max_layers": 8, "merge": "smooth", "mix": "opacity"}
-    chosen = {name: default if given[name] is None else given[name] for name, default in defaults.items()}
-    chosen_beta = chosen.pop("beta")
-    check_options(**chosen)
-    if chosen["merge"] == "exact":
-        (image,) = apply_exact(COMPOSITE_EXACT, source, chosen_beta, dimensions=1, mix=chosen["mix"])
+        count = as_int32(source.count).reshape((pixel_count,))
+        return apply(COMPOSITE_LAYERS, {"rgba": rgba, "count": count}).image.reshape((*source.shape, 4))
+    options = check_options(
+        "smooth" if merge is None else merge, "opacity" if mix is None else mix, 8 if max_layers is None else max_layers
+    )
+    beta = 1.0 if beta is None else beta
+    if options.merge == "exact":
+        alone = MergeOptions(1, options.merge, options.mix)
+        image = apply(COMPOSITE_EXACT, *exact_inputs(source, beta, alone, dimensions=1)).image
     else:
-        (image,) = apply(_COMPOSITE_FRAGMENTS, fragment_inputs(source, chosen_beta, dimensions=1), **chosen)
+        image = apply(COMPOSITE, merge_inputs(source, beta, dimensions=1), options).image
     return image.reshape((*source.shape, 4))

@@ -17,7 +17,11 @@ class SceneError(ValueError):
 
 def is_number(value: Any) -> bool:
     """Tell whether a value is a finite number, Python's or NumPy's, and not a boolean."""
-    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+    try:
+        return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+    # Whole numbers of hundreds of digits are beyond what a float holds.
+    except OverflowError:
+        return False
 
 
 def is_whole(value: object) -> bool:
@@ -70,15 +74,15 @@ def check_whole(name: str, value: Any, low: float = -math.inf, high: float = mat
     return int(value)
 
 
-def check_choice(name: str, value: Any, choices: Sequence[str]) -> None:
-    """Raise unless a value is one of `choices`."""
-    if value not in choices:
+def check_choice(name: str, value: Any, choices: Sequence[str], error: type[ValueError] = ValueError) -> None:
+    """Raise `error` unless a value is one of `choices`."""
+    if not isinstance(value, str) or value not in choices:
         expected = " or ".join(f'"{choice}"' for choice in choices)
         if len(choices) > 2:
             expected = "one of " + ", ".join(f'"{choice}"' for choice in choices)
         near = suggest(value, choices) if isinstance(value, str) else ""
         hint = f" ({near})" if near.startswith("did") else ""
-        raise ValueError(f"{name}: got {shorten(value)}, expected {expected}{hint}")
+        raise error(f"{name}: got {shorten(value)}, expected {expected}{hint}")
 
 
 def suggest(word: str, choices: Iterable[str]) -> str:
@@ -103,8 +107,18 @@ def shorten(value: Any, limit: int = 60) -> str:
         return "a table"
     if isinstance(value, (Real, str)) or value is None or isinstance(value, (list, tuple)):
         # NumPy's numbers without their types.
-        plain = getattr(value, "item", lambda: value)()
-        text = '"' + plain.replace("\n", "\\n") + '"' if isinstance(plain, str) else " ".join(repr(plain).split())
+        given: Any = value
+        plain = given.item() if hasattr(given, "item") else given
+        # Python refuses to write whole numbers of thousands of digits.
+        if isinstance(plain, int) and abs(plain) >= 10**limit:
+            return f"a whole number of {int(plain.bit_length() * math.log10(2.0)) + 1} digits or so"
+        if isinstance(plain, str):
+            text = '"' + plain.replace("\n", "\\n").replace("\0", "\\0") + '"'
+        else:
+            try:
+                text = " ".join(repr(plain).split())
+            except (ValueError, RecursionError):
+                return f"a {type(plain).__name__} that is too long to show"
         return text if len(text) <= limit else text[: limit - 1] + "…"
     shape = getattr(value, "shape", None)
     return type(value).__name__ + ("" if shape is None else f" of shape {tuple(shape)}")

@@ -1,12 +1,24 @@
 """The two data types: `Fragments`, every fragment of every pixel, and `Layers`, the few that they are resolved into."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
-from warpfrag.arrays.legacy import common_kind, dtype_name, kind_of
+from warpfrag.arrays.kinds import Kind, common_kind, dtype_name, kind_named, kind_of
+from warpfrag.arrays.operator import Output
+from warpfrag.errors import shorten
+
+# What operators return that make layers of fragments.
+LAYER_OUTPUTS = (
+    Output("rgba", "P M 4"),
+    Output("depth", "P M"),
+    Output("thickness", "P M"),
+    Output("opacity_sum", "P M"),
+    Output("count", "P", "int"),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,20 +75,56 @@ class Fragments:
     @property
     def pixel(self) -> np.ndarray:
         """The pixel of each fragment, (F,), a NumPy array."""
-        return np.repeat(np.arange(self.pixel_count), np.diff(_to_numpy(self.offsets)))
+        return np.repeat(np.arange(self.pixel_count), np.diff(_in_numpy(self.offsets)))
 
     @property
     def kind(self) -> str:
         """Kind of the arrays: "torch", "warp" or "numpy"."""
-        return common_kind({"rgba": self.rgba})
+        return _kind(self).name
+
+    def __repr__(self) -> str:
+        return f"Fragments({self.count} fragments, {_size_words(self.shape)}, {_array_words(self.rgba)})"
+
+    def __getitem__(self, pixel: Any) -> "Fragments":
+        """Return the fragments of one pixel, by its place (row, column), as those of a grid (1, 1); differentiable."""
+        number = pixel_number(pixel, self.shape)
+        begin, end = map(int, _in_numpy(self.offsets[number : number + 2]))
+        own = {name: getattr(self, name) for name in _BY_FRAGMENT}
+        parts = {name: None if array is None else array[begin:end] for name, array in own.items()}
+        offsets = self.offsets[number : number + 2] if begin == 0 else self.offsets[:0]
+        if begin:
+            kind = _kind(self)
+            offsets = kind.astype(kind.asarray([0, end - begin], self.depth), dtype_name(self.offsets))
+        return Fragments(**parts, offsets=offsets, shape=(1, 1))
+
+    def to(self, target: Any) -> "Fragments":
+        """Return the same fragments on a device, or in a precision.
+
+        Args:
+            target: a device ("cpu", "cuda:0", a `torch.device`), or "float32" or "float64", also as a dtype.
+        """
+        return replace(self, **_moved(vars(self), target))
+
+    def validate(self) -> None:
+        """Check every value, which otherwise happens only where fragments are used.
+
+        Raises:
+            ValueError: offsets step back, or a value is not finite or out of its range.
+        """
+        offsets = _in_numpy(self.offsets)
+        steps = np.diff(offsets)
+        if offsets[0] != 0 or offsets[-1] != self.count or (steps < 0).any():
+            found = f"a run from {offsets[0]} to {offsets[-1]}" if (steps >= 0).all() else "numbers that fall"
+            raise ValueError(f"offsets: got {found}, expected numbers that rise from 0 to {self.count}")
+        _check_values(self)
 
     def numpy(self) -> "Fragments":
         """Return the same fragments as NumPy arrays on the host, detached from any gradient."""
-        return Fragments(**{name: _to_numpy(value) for name, value in vars(self).items()})
+        return Fragments(**{name: _in_numpy(value) for name, value in vars(self).items()})
 
     def torch(self, device: Any = None) -> "Fragments":
         """Return the same fragments as torch tensors, sharing memory where that is possible."""
-        return Fragments(**{name: _to_torch(value, device) for name, value in vars(self).items()})
+        return Fragments(**{name: _in_torch(value, device) for name, value in vars(self).items()})
 
     @staticmethod
     def from_lists(pixels: list[list[tuple]], shape: tuple[int, ...], dtype: Any = np.float32) -> "Fragments":
@@ -146,13 +194,124 @@ class Layers:
         """Number of layers there is room for, M."""
         return self.rgba.shape[-2]
 
+    @property
+    def kind(self) -> str:
+        """Kind of the arrays: "torch", "warp" or "numpy"."""
+        return _kind(self).name
+
+    def __repr__(self) -> str:
+        return f"Layers(up to {self.max_layers} layers, {_size_words(self.shape)}, {_array_words(self.rgba)})"
+
+    def __getitem__(self, pixel: Any) -> "Layers":
+        """Return the layers of one pixel, by its place (row, column), as those of a grid (1, 1); differentiable."""
+        number, most = pixel_number(pixel, self.shape), self.max_layers
+        parts = {}
+        for name, array in vars(self).items():
+            rest = {"rgba": (most, 4), "count": ()}.get(name, (most,))
+            flat = array.reshape((math.prod(self.shape), *rest))
+            parts[name] = flat[number : number + 1].reshape((1, 1, *rest))
+        return Layers(**parts)
+
+    def to(self, target: Any) -> "Layers":
+        """Return the same layers on a device, or in a precision; see `Fragments.to`."""
+        return replace(self, **_moved(vars(self), target))
+
+    def validate(self) -> None:
+        """Check every value, which otherwise happens only where layers are used.
+
+        Raises:
+            ValueError: a count is out of its range, or a value is not finite or out of its range.
+        """
+        counts = _in_numpy(self.count)
+        outside = (counts < 0) | (counts > self.max_layers)
+        if outside.any():
+            raise ValueError(f"count: got {counts[outside][0]}, expected numbers from 0 to {self.max_layers}")
+        _check_values(self)
+
     def numpy(self) -> "Layers":
         """Return the same layers as NumPy arrays on the host, detached from any gradient."""
-        return Layers(**{name: _to_numpy(value) for name, value in vars(self).items()})
+        return Layers(**{name: _in_numpy(value) for name, value in vars(self).items()})
 
     def torch(self, device: Any = None) -> "Layers":
         """Return the same layers as torch tensors, sharing memory where that is possible."""
-        return Layers(**{name: _to_torch(value, device) for name, value in vars(self).items()})
+        return Layers(**{name: _in_torch(value, device) for name, value in vars(self).items()})
+
+
+def as_layers(outputs: SimpleNamespace, grid: tuple[int, ...]) -> Layers:
+    """Return `LAYER_OUTPUTS` of all pixels in one row as the layers of a pixel grid."""
+    most = outputs.rgba.shape[1]
+    return Layers(
+        outputs.rgba.reshape((*grid, most, 4)),
+        outputs.depth.reshape((*grid, most)),
+        outputs.thickness.reshape((*grid, most)),
+        outputs.opacity_sum.reshape((*grid, most)),
+        outputs.count.reshape(grid),
+    )
+
+
+def pixel_number(pixel: Any, shape: tuple[int, ...]) -> int:
+    """Return the number of a pixel in a grid, given its place, such as (row, column), or that number itself.
+
+    Raises:
+        ValueError: it lies outside the grid.
+    """
+    several = isinstance(pixel, (tuple, list))
+    place, limits = (tuple(pixel), shape) if several else ((pixel,), (math.prod(shape),))
+    whole = all(isinstance(each, (int, np.integer)) and not isinstance(each, bool) for each in place)
+    if len(place) != len(limits) or not whole or not all(0 <= a < b for a, b in zip(place, limits, strict=True)):
+        raise ValueError(f"pixel: got {shorten(pixel)}, expected a place in the grid of {_size_words(shape)} pixels")
+    return int(np.ravel_multi_index(tuple(int(each) for each in place), limits))
+
+
+_BY_FRAGMENT = ("rgba", "depth", "thickness", "opacity_sum", "object_id", "primitive_id")
+
+
+def _kind(source: Fragments | Layers) -> Kind:
+    return common_kind({"rgba": source.rgba})
+
+
+def _size_words(shape: tuple[int, ...]) -> str:
+    return "×".join(map(str, shape))
+
+
+def _array_words(array: Any) -> str:
+    kind = common_kind({"array": array})
+    device = kind.device_of(array)
+    return f"{dtype_name(array)}, {kind.name}" + ("" if device is None or str(device) == "cpu" else f" on {device}")
+
+
+def _moved(values: dict[str, Any], target: Any) -> dict[str, Any]:
+    """Return the arrays among the values on a device, or the floats among them in a precision."""
+    precision = str(getattr(target, "__name__", target)).removeprefix("torch.")
+    arrays = {name: (kind_of(value), value) for name, value in values.items() if kind_of(value) is not None}
+    if precision in ("float32", "float64"):
+        floats = {name: each for name, each in arrays.items() if dtype_name(each[1]).startswith("float")}
+        return {name: kind.astype(value, precision) for name, (kind, value) in floats.items() if kind is not None}
+    moved = {}
+    for name, (kind, value) in arrays.items():
+        if kind is None or kind.name == "numpy":
+            raise ValueError(
+                f"device: got {shorten(str(target))} for NumPy arrays, expected torch or Warp arrays (`.torch()`)"
+            )
+        moved[name] = value.to(target)
+    return moved
+
+
+def _check_values(source: Fragments | Layers) -> None:
+    ranges = {
+        "rgba": (-np.inf, np.inf),
+        "depth": (-np.inf, np.inf),
+        "thickness": (0, np.inf),
+        "opacity_sum": (0, np.inf),
+    }
+    values = {name: _in_numpy(getattr(source, name)) for name in ranges if getattr(source, name) is not None}
+    checks = [(name, array, *ranges[name]) for name, array in values.items()]
+    for name, array, low, high in [*checks, ("opacity", values["rgba"][..., 3], 0, 1)]:
+        good = np.isfinite(array) & (array >= low) & (array <= high)
+        if not good.all():
+            expected = "finite numbers" if low == -np.inf else f"finite numbers of at least {low}"
+            expected = "numbers from 0 to 1" if high == 1 else expected
+            raise ValueError(f"{name}: got {array[~good].flat[0]:g}, expected {expected}")
 
 
 def _grid(shape: Any) -> tuple[int, ...]:
@@ -178,10 +337,10 @@ def _check_arrays(floats: dict[str, Any], integers: dict[str, Any], optional: tu
     for name, array in integers.items():
         if array is not None and dtype_name(array) not in ("int32", "int64"):
             raise TypeError(f"{name}: got dtype {dtype_name(array)}, expected int32 or int64")
-    if kind_of(first) != "numpy":
-        for name, array in {**floats, **integers}.items():
-            if array is not None and array.device != first.device:
-                raise ValueError(f"{name}: is on {array.device}, expected {first.device} like rgba")
+    kind = common_kind({"rgba": first})
+    for name, array in {**floats, **integers}.items():
+        if array is not None and kind.device_of(array) != kind.device_of(first):
+            raise ValueError(f"{name}: got it on {array.device}, expected {first.device} like rgba")
 
 
 def _check_shape(name: str, array: Any, expected: tuple[Any, ...]) -> None:
@@ -189,20 +348,15 @@ def _check_shape(name: str, array: Any, expected: tuple[Any, ...]) -> None:
         raise ValueError(f"{name}: got shape {tuple(array.shape)}, expected {expected}")
 
 
-def _to_numpy(value: Any) -> Any:
+def _in_numpy(value: Any) -> Any:
     kind = kind_of(value)
-    if kind == "torch":
-        return value.detach().cpu().numpy()
-    return value.numpy() if kind == "warp" else value
+    return value if kind is None else kind.to_numpy(value)
 
 
-def _to_torch(value: Any, device: Any) -> Any:
-    import torch
-    import warp as wp
-
+def _in_torch(value: Any, device: Any) -> Any:
     kind = kind_of(value)
-    if kind == "warp":
-        value = wp.to_torch(value)
-    elif kind == "numpy":
-        value = torch.from_numpy(np.ascontiguousarray(value))
-    return value.to(device) if kind and device is not None else value
+    if kind is None:
+        return value
+    torch = kind_named("torch")
+    tensor = value if kind is torch else torch.from_warp(kind.to_warp(value))
+    return tensor if device is None else tensor.to(device)

@@ -1,21 +1,218 @@
 """A scene as an image: capture, resolve and composite, in bands of rows where memory is short."""
 
 from collections.abc import Mapping
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Literal, get_args
 
 import numpy as np
+import warp as wp
 
-from warpfrag.arrays.legacy import dtype_name, kind_of
-from warpfrag.capture.capture import Surfaces, check_scene, fragments_of_rows, place_surfaces
-from warpfrag.capture.memory import allowed_memory, fixed_bytes, fragment_bytes, refuse, split_rows
+from warpfrag.arrays.kinds import dtype_name, kind_of
+from warpfrag.capture.bounded import kbuffer_of_surfaces
+from warpfrag.capture.coverage import Coverage, store_coverage
+from warpfrag.capture.memory import Budget, CaptureSizes, refuse, split_rows
+from warpfrag.capture.surfaces import CameraSurfaces, SurfaceTables, check_scene, surfaces_of
 from warpfrag.composite import composite
+from warpfrag.errors import check_choice
+from warpfrag.fragments import Fragments
 from warpfrag.raster.ray import Window
-from warpfrag.raster.triangles import count_fragments, scan_counts
-from warpfrag.resolve.arguments import Merge, Mix, beta_array, check_options
-from warpfrag.scene.assemble import assemble
+from warpfrag.raster.triangles import RasterTriangles
+from warpfrag.resolve.options import check_options
 from warpfrag.scene.camera import Camera
+from warpfrag.scene.names import Merge, Mix
 from warpfrag.scene.scene import Scene
+from warpfrag.storage.into_slots import check_kbuffer
+from warpfrag.storage.kbuffer import kbuffer
+from warpfrag.storage.method import count_fragments
+
+Resolve = Literal["sorted", "kbuffer"]
+
+
+@dataclass(frozen=True, eq=False)
+class _Counted:
+    """Triangles that need too much memory to be seen at once, and how many fragments each pixel has of them."""
+
+    triangles: RasterTriangles
+    counts: wp.array
+
+
+class Renderer:
+    """Images of one scene from one camera, for one set of parameter values after the other.
+
+    What each pixel sees is kept for as long as no vertex moves in camera space: an image for another colour, opacity,
+    thickness or beta is then only shaded and composited. Every image, and its gradient, is that of a new renderer, to
+    the bit.
+
+    Args:
+        scene: what to render.
+        camera: where from; default the scene's.
+        resolve: "sorted" sorts all fragments of a pixel; "kbuffer" streams them in order of submission into slots, see
+            `kbuffer`.
+        beta: see `resolve`; default `parameters["beta"]`, or else the scene's. A k-buffer has none.
+        max_layers: see `resolve`, or the slots of a k-buffer; default the scene's `layers`.
+        merge: see `resolve` or `kbuffer`; default the scene's.
+        mix: see `resolve`; default the scene's. A k-buffer has none.
+        background: whether to composite over the scene's background.
+        memory_limit: see `render`.
+
+    Raises:
+        TypeError: an argument is of the wrong type.
+        ValueError: an argument is out of its range.
+
+    Example:
+        >>> renderer = wf.Renderer(wf.load_scene("scenes/three_spheres.toml"))
+        >>> [renderer.image({"thickness": thickness}).shape for thickness in (0.1, 0.2)]
+        [(512, 512, 4), (512, 512, 4)]
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        camera: Camera | None = None,
+        *,
+        resolve: Resolve = "sorted",
+        beta: Any = None,
+        max_layers: int | None = None,
+        merge: Merge | None = None,
+        mix: Mix | None = None,
+        background: bool = True,
+        memory_limit: float | None = None,
+    ):
+        self.camera = check_scene(scene, camera)
+        self.scene, self.resolve, self.beta = scene, resolve, beta
+        self.max_layers = scene.layers if max_layers is None else max_layers
+        self.merge, self.mix = merge or scene.merge, mix or scene.mix
+        self.background, self.memory_limit = background, memory_limit
+        check_choice("resolve", resolve, get_args(Resolve))
+        if resolve == "kbuffer":
+            check_kbuffer(self.max_layers, self.merge, "mix")
+        else:
+            check_options(self.merge, self.mix, self.max_layers)
+        self._tables: SurfaceTables | None = None
+        self._coverage: Coverage | None = None
+        self._sizes: CaptureSizes | None = None
+
+    @property
+    def coverage(self) -> Coverage:
+        """What each pixel saw the last time, or else sees in the scene as it is.
+
+        Raises:
+            MemoryError: it would take more memory than allowed.
+        """
+        if self._coverage is None:
+            surfaces = self._surfaces({})
+            with surfaces.in_order():
+                self._seen(surfaces)
+        assert self._coverage is not None
+        return self._coverage
+
+    def fragments(self, parameters: Mapping[str, Any] | None = None) -> Fragments:
+        """Return the fragments for parameter values, as `capture` does: sorted, or for a k-buffer as submitted.
+
+        Raises:
+            TypeError: a value is of the wrong type.
+            ValueError: a value is out of its range.
+            MemoryError: they would take more memory than allowed.
+        """
+        surfaces = self._surfaces(parameters or {})
+        with surfaces.in_order():
+            return self._seen(surfaces).shade_surfaces(surfaces, moved=False)
+
+    def image(self, parameters: Mapping[str, Any] | None = None) -> Any:
+        """Return the image for parameter values; see `render`, also for what is raised."""
+        values = dict(parameters or {})
+        if self.beta is not None:
+            # As a parameter it has its say in the kind and precision of the image.
+            values["beta"] = self.beta
+        kind = kind_of(values.get("beta"))
+        if kind is not None and kind.name == "warp":
+            raise TypeError("beta: got a wp.array, expected a number, a NumPy array or a torch.Tensor")
+        surfaces = self._surfaces(values)
+        beta = _beta_like(values.get("beta", self.scene.beta), surfaces)
+        with surfaces.in_order():
+            found = self._cover(surfaces)
+            if isinstance(found, Coverage):
+                image = self._composite(found.shade_surfaces(surfaces, moved=False), beta)
+            elif self.resolve == "kbuffer":
+                options = {"slots": self.max_layers, "merge": self.merge, "tail": "mix"}
+                image = composite(kbuffer_of_surfaces(surfaces, Window.of(self.camera), self.memory_limit, **options))
+            else:
+                image = self._image_in_bands(surfaces, found, beta)
+        return over_background(image, self.scene.background) if self.background else image
+
+    def _surfaces(self, parameters: Mapping[str, Any]) -> CameraSurfaces:
+        surfaces = surfaces_of(self.scene, self.camera, parameters, self._tables)
+        self._tables = surfaces.tables
+        return surfaces
+
+    def _seen(self, surfaces: CameraSurfaces) -> Coverage:
+        found = self._cover(surfaces)
+        if isinstance(found, Coverage):
+            return found
+        total = int(found.counts.numpy().sum(dtype=np.int64))
+        self._budget(surfaces).reserve(0, f"{total} fragments", total)
+        raise AssertionError("what does not fit is refused")
+
+    def _cover(self, surfaces: CameraSurfaces) -> Coverage | _Counted:
+        """Return what each pixel sees, kept from the last time if that is the same, or why there is no room for it."""
+        kept = self._coverage
+        if kept is not None and kept.is_of(surfaces):
+            if self._budget(surfaces).allows(kept.count):
+                self._coverage = kept.to(surfaces.device)
+                return self._coverage
+            self._coverage = None
+        triangles = surfaces.triangles(Window.of(self.camera))
+        self._sizes = CaptureSizes.of(triangles)
+        budget, counts = self._budget(surfaces), count_fragments(triangles)
+        if not budget.allows(int(counts.numpy().sum(dtype=np.int64))):
+            return _Counted(triangles, counts)
+        # The old one goes before the new one comes.
+        self._coverage = kept = None
+        self._coverage = store_coverage(
+            self.scene, self.camera, surfaces, triangles, counts, budget, sort=self.resolve == "sorted"
+        )
+        return self._coverage
+
+    def _budget(self, surfaces: CameraSurfaces) -> Budget:
+        assert self._sizes is not None
+        return Budget.of(self._sizes, self.memory_limit, surfaces)
+
+    def _composite(self, fragments: Fragments, beta: Any) -> Any:
+        if self.resolve == "kbuffer":
+            return composite(kbuffer(fragments, self.max_layers, merge=self.merge))  # type: ignore[arg-type]
+        return composite(fragments, beta, max_layers=self.max_layers, merge=self.merge, mix=self.mix)
+
+    def _image_in_bands(self, surfaces: CameraSurfaces, found: _Counted, beta: Any) -> Any:
+        budget, counts, width = self._budget(surfaces), found.counts, self.camera.width
+        if budget.fixed >= budget.allowed:
+            refuse(budget.fixed, budget.allowed, f"{found.triangles.count} triangles")
+        row_counts = counts.numpy().reshape(-1, width).sum(axis=1, dtype=np.int64)
+        bands = split_rows(row_counts, 0.0, budget.fragment, budget.allowed - budget.fixed)
+
+        def band_image(begin: int, end: int, *arrays: Any) -> Any:
+            """Render rows from points, colours, thickness, maps and beta: arguments, as checkpoints want them."""
+            *own, band_beta = arrays
+            part = replace(surfaces, **dict(zip(_ARRAYS, own, strict=True)))
+            # On the way back this runs again, outside of the caller's context.
+            with part.in_order():
+                triangles = part.triangles(replace(Window.of(self.camera), first_row=begin, row_count=end - begin))
+                inside = counts[begin * width : end * width]
+                coverage = store_coverage(self.scene, self.camera, part, triangles, inside, budget, sort=True)
+                fragments = coverage.shade_surfaces(part, moved=False)
+                return self._composite(fragments, _rows(band_beta, begin, end))
+
+        inputs = (*(getattr(surfaces, name) for name in _ARRAYS), beta)
+        if not surfaces.kind.records(array for array in inputs if kind_of(array) is surfaces.kind):
+            return surfaces.kind.xp.concatenate([band_image(*band, *inputs) for band in bands])
+        from torch.utils.checkpoint import checkpoint
+
+        # A graph over all bands would hold all fragments: each keeps nothing, and is captured again on the way back.
+        return surfaces.kind.xp.concatenate(
+            [checkpoint(band_image, *band, *inputs, use_reentrant=False, preserve_rng_state=False) for band in bands]
+        )
+
+
+_ARRAYS = ("points", "rgba", "thickness", "maps")
 
 
 def render(
@@ -33,7 +230,8 @@ def render(
     """Render a scene: capture its fragments, merge them into layers, and composite those.
 
     Differentiable in everything that `capture` and `resolve` are; a gradient in vertices, or in a translation or
-    rotation of an object or the camera, moves depths and attributes inside outlines, not the outlines.
+    rotation of an object or the camera, moves depths and attributes inside outlines, not the outlines. A `Renderer`
+    renders many images of one scene.
 
     An image that would take more memory than allowed is rendered in bands of rows, with the same pixels to the bit;
     then its gradient is computed band by band, each of them captured once more.
@@ -63,78 +261,27 @@ def render(
         >>> wf.render(wf.load_scene("scenes/three_spheres.toml"), beta=0.5).shape
         (512, 512, 4)
     """
-    camera = check_scene(scene, camera)
-    parameters = dict(parameters or {})
-    if beta is not None:
-        # As a parameter it has its say in the kind and precision of the image.
-        parameters["beta"] = beta
-    if kind_of(parameters.get("beta")) == "warp":
-        raise TypeError("beta: got a wp.array, expected a number, a NumPy array or a torch.Tensor")
-    options: dict[str, Any] = {
-        "max_layers": scene.layers if max_layers is None else max_layers,
-        "merge": scene.merge if merge is None else merge,
-        "mix": scene.mix if mix is None else mix,
-    }
-    check_options(options["merge"], options["mix"], options["max_layers"])
-    surfaces = place_surfaces(assemble(scene, parameters, camera=camera), camera)
-    beta = _beta_like(parameters.get("beta", scene.beta), surfaces.rgba)
-    beta_array(beta, surfaces.rgba, camera.shape)
-    window = Window.of(camera)
-    with surfaces.stream():
-        image = _render_window(surfaces, window, beta, options, memory_limit)
-    return over_background(image, scene.background) if background else image
-
-
-def _render_window(
-    surfaces: Surfaces, window: Window, beta: Any, options: Mapping[str, Any], memory_limit: float | None
-) -> Any:
-    triangles = surfaces.triangles(window)
-    allowed = allowed_memory(memory_limit, triangles.device)
-    counts = count_fragments(triangles)
-    row_counts = counts.numpy().reshape(window.row_count, window.width).sum(axis=1, dtype=np.int64)
-    gradient = surfaces.differentiable
-    fixed = fixed_bytes(triangles, gradient)
-    fragment_size = fragment_bytes(triangles.points.dtype, gradient)
-    if fixed + int(row_counts.sum()) * fragment_size <= allowed:
-        starts, total = scan_counts(counts)
-        return composite(fragments_of_rows(surfaces, triangles, starts, total, True), beta, **options)
-    if fixed >= allowed:
-        refuse(fixed, allowed, f"{triangles.corners.shape[0]} triangles")
-    del triangles
-
-    def render_band(begin: int, end: int, *tensors: Any) -> Any:
-        """Render rows from points, colours, thickness, maps and beta: arguments, as torch's checkpoints want them."""
-        *arrays, band_beta = tensors
-        band_surfaces = replace(surfaces, **dict(zip(("points", "rgba", "thickness", "maps"), arrays, strict=True)))
-        # On the way back this runs again, outside of the caller's stream.
-        with band_surfaces.stream():
-            band_triangles = band_surfaces.triangles(replace(window, first_row=begin, row_count=end - begin))
-            starts, total = scan_counts(counts[begin * window.width : end * window.width])
-            fragments = fragments_of_rows(band_surfaces, band_triangles, starts, total, True)
-            return composite(fragments, _rows(band_beta, begin, end), **options)
-
-    inputs = (surfaces.points, surfaces.rgba, surfaces.thickness, surfaces.maps, beta)
-    bands = split_rows(row_counts, 0.0, fragment_size, allowed - fixed)
-    if kind_of(surfaces.points) != "torch":
-        return np.concatenate([render_band(*band, *inputs) for band in bands])
-    import torch
-    from torch.utils.checkpoint import checkpoint
-
-    # A graph over all bands would hold all fragments: each band keeps nothing, and is captured again on the way back.
-    return torch.cat(
-        [checkpoint(render_band, *band, *inputs, use_reentrant=False, preserve_rng_state=False) for band in bands]
+    renderer = Renderer(
+        scene,
+        camera,
+        beta=beta,
+        max_layers=max_layers,
+        merge=merge,
+        mix=mix,
+        background=background,
+        memory_limit=memory_limit,
     )
+    return renderer.image(parameters)
 
 
-def _beta_like(beta: Any, like: Any) -> Any:
+def _beta_like(beta: Any, surfaces: CameraSurfaces) -> Any:
     """Return beta in the kind and precision of the image; numbers stay numbers."""
-    if kind_of(beta) is None:
+    kind = kind_of(beta)
+    if kind is None:
         return beta
-    if kind_of(like) == "numpy":
-        return beta.astype(dtype_name(like), copy=False)
-    import torch
-
-    return torch.as_tensor(beta, dtype=like.dtype, device=like.device)
+    if kind is surfaces.kind:
+        return kind.astype(beta, dtype_name(surfaces.rgba))
+    return surfaces.kind.asarray(beta, surfaces.rgba)
 
 
 def _rows(beta: Any, begin: int, end: int) -> Any:
@@ -145,6 +292,6 @@ def over_background(image: Any, background: tuple[float, float, float, float]) -
     """Composite a premultiplied image (H, W, 4), an array or a tensor, over a background of one colour."""
     if not any(background):
         return image
-    if kind_of(image) == "numpy":
-        return image + (1.0 - image[..., 3:]) * np.asarray(background, image.dtype)
-    return image + (1.0 - image[..., 3:]) * image.new_tensor(background)
+    kind = kind_of(image)
+    assert kind is not None
+    return image + (1.0 - image[..., 3:]) * kind.asarray(background, image)

@@ -1,4 +1,4 @@
-"""The time of each pass of a render: triangles, count, scan, store, sort, shade, resolve + composite.
+"""The time of each pass of a render: triangles, count, scan + store, sort, shade, resolve + composite.
 
 Every pass is timed where it is called inside `wf.render`, so that together they are the render, but for what stands
 under "rest" (checks, sums, background). "triangles ... composite" is all that depends on the camera's pixels: it leaves
@@ -28,14 +28,13 @@ import warpfrag as wf  # noqa: E402
 SCENE = Path(__file__).parents[2] / "scenes" / "bunny_in_sphere.toml"
 # The functions of each pass: the module that calls them, and their name there.
 PASSES = {
-    "assemble": (("warpfrag.capture.render", "assemble"), ("warpfrag.capture.render", "place_surfaces")),
-    "triangles": (("warpfrag.capture.capture", "prepare_triangles"),),
-    "count": (("warpfrag.capture.render", "count_fragments"),),
-    "scan": (("warpfrag.capture.render", "scan_counts"),),
-    "store": (("warpfrag.capture.capture", "store_fragments"),),
-    "sort": (("warpfrag.capture.capture", "sort_fragments"),),
-    "shade": (("warpfrag.capture.capture", "apply"),),
-    "resolve + composite": (("warpfrag.capture.render", "composite"),),
+    "assemble": (("warpfrag.render", "surfaces_of"),),
+    "triangles": (("warpfrag.capture.surfaces", "prepare_triangles"),),
+    "count": (("warpfrag.render", "count_fragments"),),
+    "scan + store": (("warpfrag.capture.coverage", "fill"),),
+    "sort": (("warpfrag.capture.coverage", "sort_lists"),),
+    "shade": (("warpfrag.capture.coverage", "apply"),),
+    "resolve + composite": (("warpfrag.render", "composite"),),
 }
 NOT_PIXELS = ("assemble", "rest", "all")
 

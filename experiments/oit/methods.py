@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import warpfrag as wf
-from warpfrag.files.images import linear_to_srgb
+from warpfrag.colors import linear_to_srgb
 
 # The paper's K and M.
 SLOTS = 8

@@ -26,11 +26,11 @@ import study_scenes as scenes  # noqa: E402
 from methods import BETA, COMPARED, OTHERS, SLOTS, over_background  # noqa: E402
 
 import warpfrag as wf  # noqa: E402
-from warpfrag.capture.capture import place_surfaces  # noqa: E402
+from warpfrag.capture.surfaces import place_surfaces  # noqa: E402
 from warpfrag.files.saving import replacing  # noqa: E402
 from warpfrag.raster.ray import Window  # noqa: E402
-from warpfrag.raster.triangles import count_fragments, scan_counts  # noqa: E402
 from warpfrag.scene.assemble import assemble  # noqa: E402
+from warpfrag.storage.method import count_fragments, scan_counts  # noqa: E402
 
 RESULTS = Path("results") / "oit"
 # Multiples of P(z) and numbers of slots that errors are measured at, beside the paper's 100 and 8.

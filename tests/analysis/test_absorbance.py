@@ -119,14 +119,14 @@ def test_empty_pixel():
 @pytest.mark.parametrize(
     ("pixel", "options", "error", "message"),
     [
-        ((1, 0), {}, ValueError, r"pixel: got \(1, 0\), expected an index into the pixel grid \(1, 1\)"),
+        ((1, 0), {}, ValueError, r"pixel: got \(1, 0\), expected a place in the grid of 1×1 pixels"),
         ((0,), {}, ValueError, r"pixel: got \(0,\)"),
         (1, {}, ValueError, "pixel: got 1"),
         ((0.0, 0), {}, ValueError, "pixel: got"),
         ((0, 0), {"beta": 2.0}, ValueError, "beta: got 2.0"),
         ((0, 0), {"beta": np.zeros(3)}, ValueError, r"beta: got shape \(3,\)"),
-        ((0, 0), {"mix": "sum"}, ValueError, "mix: got 'sum'"),
-        ((0, 0), {"merge": "sum"}, ValueError, "merge: got 'sum'"),
+        ((0, 0), {"mix": "sum"}, ValueError, 'mix: got "sum"'),
+        ((0, 0), {"merge": "sum"}, ValueError, 'merge: got "sum"'),
     ],
 )
 def test_mistakes(pixel, options, error, message):
@@ -137,7 +137,7 @@ def test_mistakes(pixel, options, error, message):
 
 def test_layers_are_merged():
     """Layers take no way to merge, and other things are no source."""
-    with pytest.raises(TypeError, match="merge: goes with Fragments only"):
+    with pytest.raises(TypeError, match="merge: got it with Layers, expected Fragments"):
         wf.absorbance(wf.resolve(one_pixel((0.5, 1.0, 0.0))), (0, 0), merge="smooth")
     with pytest.raises(TypeError, match="source: got int"):
         wf.absorbance(1, (0, 0))

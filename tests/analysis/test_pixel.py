@@ -96,10 +96,10 @@ def test_command(folder, capsys):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--pixel", "12"], "--pixel: found '12', expected column and row such as 320,240"),
-        (["--pixel", "5000,8"], "pixel: found 5000,8, expected a column below"),
-        (["--pixel", "1,1", "-o", "a.jpg"], "a.jpg: found the suffix .jpg, expected .png"),
-        (["--pixel", "1,1", "-o", "no/a.png"], "found no folder no"),
+        (["--pixel", "12"], '--pixel: got "12", expected column and row such as 320,240'),
+        (["--pixel", "5000,8"], "pixel: got 5000,8, expected a column below"),
+        (["--pixel", "1,1", "-o", "a.jpg"], "a.jpg: got the suffix .jpg, expected .png"),
+        (["--pixel", "1,1", "-o", "no/a.png"], "got no folder no"),
         (["--pixel", "1,1", "--set", "bal.opacity=1"], "ball.opacity"),
         ([], "Missing option"),
     ],

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import textwrap
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from pixels import generic_pixels, random_pixels
 
 import warpfrag as wf
 from warpfrag import Fragments
-from warpfrag.resolve.arguments import Walk
+from warpfrag.resolve.walk import walk_backward
 
 PIXELS = generic_pixels(4, 6, 6, opaque=True)
 OPACITY_SUM = np.linspace(1.0, 2.0, len(PIXELS.depth)) * PIXELS.rgba[:, 3]
@@ -119,13 +120,13 @@ def test_no_output_used_is_no_gradient(device):
 def test_only_wanted_gradients_are_computed(monkeypatch, wanted, function, merge):
     """Inputs that require no gradient get none, and the adjoint is told so."""
     asked = []
-    backward = Walk.backward
 
-    def spy(self, kernel, grads, grad_inputs):
-        asked.append([index for index, grad in enumerate(grad_inputs) if grad is not None])
-        return backward(self, kernel, grads, grad_inputs)
+    def spy(kernel, inputs, options, grad_out, targets):
+        asked.append({name for name, target in vars(targets).items() if target is not None})
+        return walk_backward(kernel, inputs, options, grad_out, targets)
 
-    monkeypatch.setattr(Walk, "backward", spy)
+    for module in ("warpfrag.resolve.resolve", "warpfrag.composite"):
+        monkeypatch.setattr(import_module(module), "walk_backward", spy)
     fragments = leaves()
     beta = torch.full((2, 3), 0.3, dtype=torch.float64)
     tensors = [fragments.rgba, fragments.depth, fragments.thickness, beta, fragments.opacity_sum]
@@ -138,7 +139,8 @@ def test_only_wanted_gradients_are_computed(monkeypatch, wanted, function, merge
         result = function(rebuild(fragments, [*given[:3], given[4]]), given[3], merge=merge)
         (result if function is wf.composite else result.rgba).square().sum().backward()
         found.append([t.grad for t in given])
-    assert asked[-1] == sorted(index + (index > 2) for index in wanted)
+    names = ("rgba", "depth", "thickness", "beta", "opacity_sum")
+    assert asked[-1] == {names[index] for index in wanted}
     for index, (everything, some) in enumerate(zip(*found, strict=True)):
         if index in wanted:
             assert torch.equal(everything, some)
@@ -210,7 +212,7 @@ def test_gradients_of_nothing(device, shape):
 def test_second_derivatives_are_refused(device):
     """By name and at the second backward only: `create_graph` by itself does no harm."""
     fragments = leaves(device)
-    for name, function in (("composite_fragments", wf.composite), ("resolve", lambda f: wf.resolve(f).rgba)):
+    for name, function in (("composite", wf.composite), ("resolve", lambda f: wf.resolve(f).rgba)):
         (gradient,) = torch.autograd.grad(function(fragments).square().sum(), fragments.depth, create_graph=True)
         assert gradient.abs().max() > 0.0
         with pytest.raises(NotImplementedError, match=f"warpfrag.{name}: second derivatives .* are not supported"):
@@ -228,7 +230,7 @@ def test_errors_of_values_pass_through_torch(device):
     fragments = leaves(device)
     wrong = fragments.thickness.detach().clone()
     wrong[3] = -1.0
-    with pytest.raises(ValueError, match=r"fragment 3 has .*thickness -1.0"):
+    with pytest.raises(ValueError, match=r"got .*thickness -1.0.* in fragment 3"):
         wf.composite(rebuild(fragments, [fragments.rgba, fragments.depth, wrong, fragments.opacity_sum]))
     with pytest.raises(TypeError, match="beta: got a numpy array, expected a torch array like the fragments"):
         wf.composite(fragments, np.array(0.5))
@@ -254,8 +256,8 @@ def test_operators_obey_the_rules_of_torch():
     fragments = leaves()
     beta = torch.full((6,), 0.5, dtype=torch.float64, requires_grad=True)
     wf.composite(fragments)
-    arguments = (*floats(fragments)[:3], fragments.offsets, beta, fragments.opacity_sum, 2, "smooth", "opacity")
-    torch.library.opcheck(torch.ops.warpfrag.composite_fragments.default, arguments)
+    arguments = (*floats(fragments)[:3], fragments.offsets, fragments.opacity_sum, beta, 2, "smooth", "opacity")
+    torch.library.opcheck(torch.ops.warpfrag.composite.default, arguments)
     torch.library.opcheck(torch.ops.warpfrag.resolve.default, arguments)
     layers = wf.resolve(fragments)
     rgba = layers.rgba.detach().reshape(6, 8, 4).requires_grad_()
@@ -325,3 +327,58 @@ def test_float32_stays_float32(device):
         assert image.dtype == torch.float32
         (gradient,) = torch.autograd.grad(image.sum(), fragments.rgba)
         assert gradient.dtype == torch.float32
+
+
+# torch.func.
+
+
+def test_transforms_are_those_of_autograd():
+    """`grad`, `jacrev` and `vmap` agree with backward and with a loop."""
+    fragments = leaves()
+    rgba = fragments.rgba.detach()
+
+    def image(rgba):
+        return wf.composite(rebuild(fragments, [rgba, *(t.detach() for t in floats(fragments)[1:])]), 0.4)
+
+    expected = torch.autograd.functional.jacobian(image, rgba)
+    torch.testing.assert_close(torch.func.jacrev(image)(rgba), expected, rtol=0.0, atol=0.0)
+    total = torch.func.grad(lambda rgba: image(rgba).sum())(rgba)
+    torch.testing.assert_close(total, expected.sum((0, 1, 2)), rtol=1e-13, atol=1e-13)
+    batch = torch.stack([rgba, 0.5 * rgba])
+    torch.testing.assert_close(torch.func.vmap(image)(batch), torch.stack([image(one) for one in batch]))
+
+
+def test_transforms_of_several_outputs():
+    """Layers have outputs of several types; a count has no gradient."""
+    fragments = leaves()
+    rest = [t.detach() for t in floats(fragments)[1:]]
+
+    def depths(rgba):
+        return wf.resolve(rebuild(fragments, [rgba, *rest]), max_layers=2).rgba
+
+    rgba = fragments.rgba.detach()
+    expected = torch.autograd.functional.jacobian(depths, rgba)
+    torch.testing.assert_close(torch.func.jacrev(depths)(rgba), expected, rtol=0.0, atol=0.0)
+
+
+@pytest.mark.parametrize("transform", ["jvp", "jacfwd", "hessian", "dual"])
+def test_forward_mode_is_refused(transform):
+    """In our words, instead of a derivative of zero."""
+    fragments = leaves()
+    rgba = fragments.rgba.detach()
+
+    def total(rgba):
+        return wf.composite(rebuild(fragments, [rgba, *(t.detach() for t in floats(fragments)[1:])])).sum()
+
+    def dual(rgba):
+        with torch.autograd.forward_ad.dual_level():
+            total(torch.autograd.forward_ad.make_dual(rgba, torch.ones_like(rgba)))
+
+    calls = {
+        "jvp": lambda: torch.func.jvp(total, (rgba,), (torch.ones_like(rgba),)),
+        "jacfwd": lambda: torch.func.jacfwd(total)(rgba),
+        "hessian": lambda: torch.func.hessian(total)(rgba),
+        "dual": lambda: dual(rgba),
+    }
+    with pytest.raises(NotImplementedError, match=r"warpfrag\.composite: got a forward-mode derivative"):
+        calls[transform]()

@@ -12,7 +12,7 @@ from capture_scenes import orthographic, perspective, quad, scene, soup
 
 from warpfrag.capture import bounded as module
 from warpfrag.capture.bounded import capture_kbuffer, count_culled, kbuffer_bytes
-from warpfrag.capture.capture import capture
+from warpfrag.capture.coverage import capture
 from warpfrag.storage.kbuffer import kbuffer
 
 OUTPUTS = ("rgba", "depth", "thickness", "opacity_sum", "count")

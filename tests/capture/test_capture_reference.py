@@ -10,7 +10,7 @@ import pytest
 from capture_scenes import rays_through, scene, surface
 from opengl_depth import NO_OPENGL
 
-from warpfrag.capture.capture import capture
+from warpfrag.capture.coverage import capture
 from warpfrag.files.meshes import load_mesh, warp_asset
 from warpfrag.scene.camera import Camera
 

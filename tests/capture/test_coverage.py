@@ -6,8 +6,7 @@ import torch
 import warp as wp
 from capture_scenes import orthographic, perspective, pixels_of, quad, scene, soup, surface
 
-from warpfrag.capture.capture import capture
-from warpfrag.capture.coverage import Coverage
+from warpfrag.capture.coverage import Coverage, capture
 from warpfrag.scene.camera import Camera
 from warpfrag.scene.pose import pose_matrix
 

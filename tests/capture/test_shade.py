@@ -5,7 +5,7 @@ import pytest
 import torch
 from capture_scenes import orthographic, perspective, pixels_of, quad, rays_through, scene, soup, surface
 
-from warpfrag.capture.capture import capture
+from warpfrag.capture.coverage import capture
 from warpfrag.scene.camera import Camera
 from warpfrag.scene.depth_resolution import z_resolution
 from warpfrag.shapes.primitives import sphere

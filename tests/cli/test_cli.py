@@ -92,34 +92,37 @@ def test_set_moves_objects_and_the_camera(folder):
 MISTAKES = [
     (["rendr"], "No such command 'rendr'"),
     (["render", "scene.toml"], "Missing option"),
-    (["render", "none.toml", "-o", "a.png"], "none.toml: found no such file"),
-    (["render", "scene.toml", "-o", "a.jpg"], "a.jpg: found the suffix .jpg"),
-    (["render", "scene.toml", "-o", "no/a.png"], "found no folder no"),
-    (["render", "scene.toml", "-o", "a.png", "--bits", "12"], "bits: found 12"),
-    (["render", "scene.toml", "-o", "a.png", "--beta", "2"], "beta: got 2"),
-    (["render", "scene.toml", "-o", "a.png", "--beta", "x"], "--beta"),
-    (["render", "scene.toml", "-o", "a.png", "--size", "12"], "--size: found '12'"),
-    (["render", "scene.toml", "-o", "a.png", "--merge", "smoth"], "merge: got"),
-    (["render", "scene.toml", "-o", "a.png", "--layers", "0"], "layers: got 0"),
-    (["render", "scene.toml", "-o", "a.png", "--thickness", "2Q"], "--thickness: found '2Q'"),
-    (["render", "scene.toml", "-o", "a.png", "--thickness", "-1"], "thickness: got -1"),
-    (["render", "scene.toml", "-o", "a.png", "--background", "red"], "--background: found 'red'"),
+    (["render", "none.toml", "-o", "a.png"], "none.toml: got no such file"),
+    (["render", "scene.toml", "-o", "a.jpg"], "a.jpg: got the suffix .jpg"),
+    (["render", "scene.toml", "-o", "no/a.png"], "got no folder no"),
+    (["render", "scene.toml", "-o", "a.png", "--bits", "12"], "bits: got 12"),
+    (["render", "scene.toml", "-o", "a.png", "--beta", "2"], "--beta: got 2, expected a number from 0 to 1"),
+    (["render", "scene.toml", "-o", "a.png", "--beta", "x"], '--beta: got "x", expected a number from 0 to 1'),
+    (["render", "scene.toml", "-o", "a.png", "--size", "12"], '--size: got "12"'),
+    (["render", "scene.toml", "-o", "a.png", "--merge", "smoth"], "merge: "),
+    (
+        ["render", "scene.toml", "-o", "a.png", "--layers", "0"],
+        "--layers: got 0, expected a whole number",
+    ),
+    (["render", "scene.toml", "-o", "a.png", "--thickness", "2Q"], '--thickness: got "2Q"'),
+    (["render", "scene.toml", "-o", "a.png", "--thickness", "-1"], "thickness: "),
+    (["render", "scene.toml", "-o", "a.png", "--background", "red"], '--background: got "red"'),
     (["render", "scene.toml", "-o", "a.png", "--set", "beta"], "expected NAME=VALUE"),
     (["render", "scene.toml", "-o", "a.png", "--set", "bal.opacity=1"], 'did you mean "ball.opacity"?'),
-    (["render", "scene.toml", "-o", "a.png", "--set", "ball.opacity=2"], "ball.opacity: got 2"),
+    (["render", "scene.toml", "-o", "a.png", "--set", "ball.opacity=2"], "ball.opacity: "),
     (["render", "scene.toml", "-o", "a.png", "--set", "ball.rotation=1,2"], "expected x,y,z"),
-    (["render", "scene.toml", "-o", "a.png", "--set", "camera.rotation=0,nan,0"], "expected numbers that are finite"),
-    (["fit", "none.toml"], "none.toml: found no such file"),
-    (["fit", "study.toml", "--steps", "0"], "steps: got 0"),
-    (["fit", "study.toml", "--resume"], "got no checkpoint to resume"),
-    (["fit"], "fit: found neither STUDY nor --all"),
-    (["fit", "study.toml", "--all"], "fit: found both STUDY and --all"),
-    (["fit", "study.toml", "--from", "."], "--from: found it without --all"),
-    (["fit", "--all"], "experiments/fit: got no such folder"),
-    (["fit", "--all", "--from", "."], "got no study, expected folders with a study.py"),
-    (["fit", "--all", "--size", "8x8"], "--size: found it with --all"),
-    (["fit", ".", "--resume"], "--resume: found it with ., expected it with a study file only"),
-    (["fit", "."], "found no study.py in it"),
+    (["render", "scene.toml", "-o", "a.png", "--set", "camera.rotation=0,nan,0"], "expected 3 finite numbers"),
+    (["fit", "none.toml"], "none.toml: got no such file"),
+    (["fit", "study.toml", "--steps", "0"], "--steps: got 0"),
+    (["fit", "study.toml", "--resume"], "no checkpoint to resume"),
+    (["fit"], "fit: got neither STUDY nor --all"),
+    (["fit", "study.toml", "--all"], "fit: got both STUDY and --all"),
+    (["fit", "study.toml", "--from", "."], "--from: got it without --all"),
+    (["fit", "--all"], "experiments/fit: "),
+    (["fit", "--all", "--from", "."], "no study, expected folders with a study.py"),
+    (["fit", "--all", "--size", "8x8"], "--size: got it with --all"),
+    (["fit", ".", "--resume"], "--resume: got it with ., expected it with a study file only"),
+    (["fit", "."], "got no study.py in it"),
 ]
 
 
@@ -189,7 +192,7 @@ def test_fit_logs_to_tensorboard(folder, capsys, monkeypatch):
 
 def start(*words: str) -> subprocess.Popen:
     """Start the command line in a process of its own."""
-    command = [sys.executable, "-m", "warpfrag.cli", *words]
+    command = [sys.executable, "-m", "warpfrag", *words]
     return subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
 
@@ -337,3 +340,80 @@ def test_interrupted_fit_all_stops_the_study(folder):
     assert told.splitlines()[-1] == "warpfrag: stopped in sleeping (1 of 1); the report is not written"
     assert (folder / "ended").exists()
     assert not list(folder.glob("**/report.html"))
+
+
+def run(*words: str, **options) -> subprocess.CompletedProcess:
+    """Run the command line in a process of its own."""
+    return subprocess.run([sys.executable, "-m", "warpfrag", *words], capture_output=True, text=True, **options)
+
+
+def test_examples_are_listed_rendered_and_copied(folder, capsys):
+    """Examples stand for paths, are listed with what they show, and copied with the scenes that they name."""
+    assert main(["examples"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert any(line.startswith("three_spheres ") and "Three translucent spheres" in line for line in lines)
+    assert main(["render", "example:three_spheres", "-o", "a.png", "--size", "16x16"]) == 0
+    assert main(["examples", "studies/three_spheres", "-o", "mine"]) == 0
+    assert sorted(str(path) for path in Path("mine").rglob("*.toml")) == [
+        "mine/studies/three_spheres.toml",
+        "mine/three_spheres.toml",
+    ]
+    Path("mine/three_spheres.toml").write_text("changed")
+    assert main(["examples", "-o", "mine"]) == 2
+    assert "expected none in its place" in capsys.readouterr().err
+    assert main(["render", "example:three_sphere", "-o", "a.png"]) == 2
+    assert 'did you mean "three_spheres"?' in capsys.readouterr().err
+
+
+def test_what_a_fit_found_goes_back_in(folder, capsys):
+    """`--parameters` gives the values of a result.json to render, inspect and fit; --set comes on top."""
+    found = {"ball.color": [0.2, 0.4, 0.6], "ball.opacity": 0.25, "beta": 0.5}
+    Path("result.json").write_text(json.dumps({"found": found}))
+    words = [f"--set={name}={json.dumps(value).strip('[]')}" for name, value in found.items()]
+    assert main(["render", "scene.toml", "-o", "a.npy", "--parameters", "result.json"]) == 0
+    assert main(["render", "scene.toml", "-o", "b.npy", *words]) == 0
+    np.testing.assert_array_equal(np.load("a.npy"), np.load("b.npy"))
+    assert main(["inspect", "scene.toml", "--pixel", "12,8", "--parameters", "result.json", "-o", "p.png"]) == 0
+    assert "0.250" in capsys.readouterr().out
+    del found["beta"]
+    Path("result.json").write_text(json.dumps({"found": found}))
+    assert main(["fit", "study.toml", "--steps", "1", "--size", "12x8", "--parameters", "result.json"]) == 0
+    assert json.loads(Path("results/study/result.json").read_text())["start"] == found
+    Path("result.json").write_text(json.dumps({"found": {"bal.opacity": 1.0}}))
+    capsys.readouterr()
+    assert main(["render", "scene.toml", "-o", "a.npy", "--parameters", "result.json"]) == 2
+    assert 'got the unknown name "bal.opacity"; did you mean "ball.opacity"?' in capsys.readouterr().err
+
+
+def test_names_that_shells_and_settings_could_misread(folder, capsys):
+    """A name with an equals sign can be set; the command that goes on with a fit is quoted for the shell."""
+    from warpfrag.cli.fit import _command
+
+    (folder / "scene.toml").write_text(SCENE.replace('"ball"', '"a=b"'))
+    assert main(["render", "scene.toml", "-o", "a.npy", "--set", "a=b.opacity=0.5"]) == 0
+    assert _command("my $study.toml", None, {"--steps": 3}) == "warpfrag fit 'my $study.toml' --steps 3"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device that is always full is Linux's")
+def test_full_and_closed_streams(folder):
+    """What cannot be written is a failure; a closed standard error is none."""
+    with open("/dev/full", "w") as full:
+        words = [sys.executable, "-m", "warpfrag", "examples"]
+        done = subprocess.run(words, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "standard output: cannot be written (No space left on device)" in done.stderr
+    os.symlink("/dev/full", "full.png")
+    done = run("render", "scene.toml", "-o", "full.png")
+    assert (done.returncode, done.stderr) == (
+        2,
+        "warpfrag: full.png: got a device, expected a file to write or replace\n",
+    )
+    done = subprocess.run(f"{sys.executable} -m warpfrag render none.toml -o a.png 2>&-", shell=True, check=False)
+    assert done.returncode == 2
+
+
+@pytest.mark.parametrize("size", ["99999x99999", "65537x1", "0x3", "40000x40000"])
+def test_sizes_out_of_range_are_named(folder, capsys, size):
+    """A size that no image has is refused before anything is allocated."""
+    assert main(["render", "scene.toml", "-o", "a.png", "--size", size]) == 2
+    assert f'--size: got "{size}", expected width and height' in capsys.readouterr().err

@@ -5,7 +5,8 @@ import png
 import pytest
 from PIL import Image
 
-from warpfrag.files.images import ImageError, encode, linear_to_srgb, read_image, write_image
+from warpfrag.colors import encode, linear_to_srgb
+from warpfrag.files.images import ImageError, read_image, write_image
 
 
 @pytest.fixture
@@ -101,13 +102,13 @@ def test_corrupt_files_are_refused(tmp_path, image, name):
 def test_wrong_size_name_and_values(tmp_path, image):
     """Other sizes, missing files, unknown suffixes, bits, shapes and NaN are refused."""
     write_image(tmp_path / "a.png", image)
-    with pytest.raises(ImageError, match="found 5 × 7 pixels, expected 7 × 5"):
+    with pytest.raises(ImageError, match="got 5 × 7 pixels, expected 7 × 5"):
         read_image(tmp_path / "a.png", size=(7, 5))
     with pytest.raises(ImageError, match="no such file"):
         read_image(tmp_path / "b.png")
     with pytest.raises(ImageError, match=r"\.jpg"):
         write_image(tmp_path / "b.jpg", image)
-    with pytest.raises(ImageError, match="found 12"):
+    with pytest.raises(ImageError, match="got 12"):
         write_image(tmp_path / "b.png", image, bits=12)
     with pytest.raises(ImageError, match="shape"):
         write_image(tmp_path / "b.png", image[..., :2])

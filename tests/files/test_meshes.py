@@ -298,11 +298,11 @@ def test_usd_preview_surface_gives_the_color(usd):
 
 def test_usd_hidden_and_empty(usd):
     """Invisible meshes are left out; a stage without any says what it holds instead."""
-    with pytest.raises(ValueError, match=r"found no faces in .*expected a mesh with triangles"):
+    with pytest.raises(ValueError, match=r"got no faces in .*expected a mesh with triangles"):
         usd('token visibility = "invisible"')
     with pytest.raises(ValueError, match=r"it holds Sphere"):
         usd(text='#usda 1.0\ndef Sphere "s"\n{\n}\n')
-    with pytest.raises(ValueError, match="found a USD file that cannot be read"):
+    with pytest.raises(ValueError, match="got a USD file that cannot be read"):
         usd(text="nonsense")
     with pytest.raises(ValueError, match="its faces need 7 indices"):
         usd(text=USD.replace("3, 3, 2, 4]", "3, 3, 2]"))
@@ -313,7 +313,7 @@ def test_usd_references_stay_inside(usd, tmp_path):
     write(tmp_path, "outside.usda", '#usda 1.0\n( defaultPrim = "m" )\ndef Mesh "m"\n{\n}\n')
     inner = '#usda 1.0\ndef "x" (references = @../outside.usda@)\n{\n}\n'
     path = write(tmp_path / "in", "a.usda", inner)
-    with pytest.raises(ValueError, match=r"found a reference to .*outside.usda in .*expected references inside"):
+    with pytest.raises(ValueError, match=r"got a reference to .*outside.usda in .*expected references inside"):
         load_mesh(path)
 
 
@@ -335,11 +335,11 @@ def test_asset_of_the_warp_wheel():
 @pytest.mark.parametrize(
     ("name", "text", "words"),
     [
-        ("a.gltf", "{", "found a gltf file that cannot be read"),
+        ("a.gltf", "{", "got a gltf file that cannot be read"),
         ("a.obj", "v 0 0 0\nf 1 2 3\n", "a.obj"),
         ("a.obj", "v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "a.obj"),
         ("a.stl", "", "a.stl"),
-        ("a.glb", "glTF", "found a glb file that cannot be read"),
+        ("a.glb", "glTF", "got a glb file that cannot be read"),
         ("a.xyz", "", "of an unknown kind, expected one of .ply"),
     ],
 )

@@ -126,71 +126,71 @@ def test_shipped_scenes_load(path):
 
 BALL = '[[object]]\nname = "ball"\nprimitive = "sphere"\n'
 COMPLAINTS = {
-    "syntax": ("beta = 0.5\neye = = 1\n", "line 2: found what is not TOML"),
-    "open end": ("beta = [0.5\n", "line 1: found what is not TOML"),
-    "no camera": (BALL, "camera: found none"),
-    "no objects": (CAMERA, r"object: found none, expected one or more tables headed \[\[object\]\]"),
-    "one object": (CAMERA + '[object]\nname = "x"\n', "object: found one table"),
-    "top key": ("bta = 1\n" + CAMERA + BALL, 'bta: found an unknown key; did you mean "beta"?'),
-    "camera key": (CAMERA + "foov = 3\n" + BALL, r'camera.foov: found an unknown key; did you mean "fov"\?'),
-    "camera eye": ("[camera]\ntarget = [0, 0, 0]\nfov = 1\n" + BALL, "camera.eye: found none, expected 3 numbers"),
-    "camera both": (CAMERA + "height = 2.0\n" + BALL, "camera: got both of fov and height"),
-    "near far": (CAMERA + "near = 5\nfar = 1\n" + BALL, "camera.far: got 1"),
-    "size": (CAMERA + "size = [512.0, 512]\n" + BALL, "camera.size: found .*two whole numbers"),
+    "syntax": ("beta = 0.5\neye = = 1\n", "line 2: got what is not TOML"),
+    "open end": ("beta = [0.5\n", "line 1: got what is not TOML"),
+    "no camera": (BALL, "camera: got none"),
+    "no objects": (CAMERA, r"object: got none, expected one or more tables headed \[\[object\]\]"),
+    "one object": (CAMERA + '[object]\nname = "x"\n', "object: got one table"),
+    "top key": ("bta = 1\n" + CAMERA + BALL, 'bta: got an unknown key; did you mean "beta"?'),
+    "camera key": (CAMERA + "foov = 3\n" + BALL, r'camera.foov: got an unknown key; did you mean "fov"\?'),
+    "camera eye": ("[camera]\ntarget = [0, 0, 0]\nfov = 1\n" + BALL, "camera.eye: got none, expected 3 numbers"),
+    "camera both": (CAMERA + "height = 2.0\n" + BALL, "camera: .* both of fov and height"),
+    "near far": (CAMERA + "near = 5\nfar = 1\n" + BALL, "camera.far: .* 1"),
+    "size": (CAMERA + "size = [512.0, 512]\n" + BALL, "camera.size: got .*two whole numbers"),
     "huge size": (CAMERA + "size = [1000000, 512]\n" + BALL, "camera.size"),
-    "beta range": ("beta = 1.5\n" + CAMERA + BALL, "beta: found 1.5, expected a number from 0 to 1"),
-    "beta nan": ("beta = nan\n" + CAMERA + BALL, "beta: found nan"),
-    "beta bool": ("beta = true\n" + CAMERA + BALL, "beta: found true, expected a number from 0 to 1"),
-    "layers": ("layers = 0\n" + CAMERA + BALL, "layers: found 0, expected a whole number from 1"),
-    "merge": ('merge = "smoth"\n' + CAMERA + BALL, r'merge: found "smoth", expected one of .*did you mean "smooth"\?'),
+    "beta range": ("beta = 1.5\n" + CAMERA + BALL, "beta: got 1.5, expected a number from 0 to 1"),
+    "beta nan": ("beta = nan\n" + CAMERA + BALL, "beta: got nan"),
+    "beta bool": ("beta = true\n" + CAMERA + BALL, "beta: got true, expected a number from 0 to 1"),
+    "layers": ("layers = 0\n" + CAMERA + BALL, "layers: got 0, expected a whole number from 1 to"),
+    "merge": ('merge = "smoth"\n' + CAMERA + BALL, r'merge: got "smoth", expected one of .*did you mean "smooth"\?'),
     "background": (
         'background = "white"\n' + CAMERA + BALL,
-        r'background: found "white", expected 3 numbers .*#rrggbb',
+        r'background: got "white", expected 3 numbers .*#rrggbb',
     ),
     "light": (CAMERA + "[light]\ndirection = [0, 0, 0]\n" + BALL, "light.direction"),
-    "ambient": (CAMERA + "[light]\nambient = -1\n" + BALL, "light.ambient: found -1"),
+    "ambient": (CAMERA + "[light]\nambient = -1\n" + BALL, "light.ambient: got -1"),
     "no shape": (
         CAMERA + '[[object]]\nname = "x"\n',
-        r'object\[0\] of "x": found no shape, expected mesh, primitive or points',
+        r'object\[0\] of "x": got no shape, expected mesh, primitive or points',
     ),
-    "both": (CAMERA + BALL + 'mesh = "a.obj"\n', "found both mesh and primitive"),
+    "both": (CAMERA + BALL + 'mesh = "a.obj"\n', "got both mesh and primitive"),
     "primitive": (CAMERA + '[[object]]\nprimitive = "spere"\n', r'object\[0\].primitive: .*did you mean "sphere"\?'),
-    "other size": (CAMERA + BALL + "tube = 1\n", 'tube of "ball": found an unknown key of primitive "sphere"'),
+    "other size": (CAMERA + BALL + "tube = 1\n", 'tube of "ball": got an unknown key of primitive "sphere"'),
     "object key": (CAMERA + BALL + "opacty = 1\n", r'object\[0\].opacty of "ball": .*did you mean "opacity"\?'),
     "opacity": (
         CAMERA + BALL + "opacity = 1.5\n",
-        r'object\[0\].opacity of "ball": found 1.5, expected a number from 0',
+        r'object\[0\].opacity of "ball": got 1.5, expected a number from 0',
     ),
-    "radius": (CAMERA + BALL + "radius = -1\n", "radius.*found -1, expected a number above 0"),
-    "radius text": (CAMERA + BALL + 'radius = "1"\n', 'radius.*found "1", expected a number above 0'),
-    "segments": (CAMERA + BALL + "segments = 2\n", "segments.*found 2, expected a whole number from 3"),
-    "thickness": (CAMERA + BALL + "thickness = -1\n", 'thickness.*found -1, expected a number from 0, or .*"2P"'),
-    "thickness text": (CAMERA + BALL + 'thickness = "-2P"\n', 'thickness.*found "-2P"'),
-    "thickness inf": (CAMERA + BALL + "thickness = inf\n", "thickness.*found inf"),
+    "radius": (CAMERA + BALL + "radius = -1\n", "radius.*got -1, expected a number above 0"),
+    "radius text": (CAMERA + BALL + 'radius = "1"\n', 'radius.*got "1", expected a number above 0'),
+    "segments": (CAMERA + BALL + "segments = 2\n", "segments.*got 2, expected a whole number from 3"),
+    "thickness": (CAMERA + BALL + "thickness = -1\n", 'thickness.*got -1, expected a number of at least 0, or .*"2P"'),
+    "thickness text": (CAMERA + BALL + 'thickness = "-2P"\n', 'thickness.*got "-2P"'),
+    "thickness inf": (CAMERA + BALL + "thickness = inf\n", "thickness.*got inf"),
     "color": (CAMERA + BALL + "color = [1, 2, 3]\n", "color.*expected 3 numbers from 0 to 1"),
-    "color hex": (CAMERA + BALL + 'color = "#12345"\n', 'color.*found "#12345"'),
-    "scale": (CAMERA + BALL + "scale = 0\n", "scale.*found 0, expected a number other than 0"),
+    "color hex": (CAMERA + BALL + 'color = "#12345"\n', 'color.*got "#12345"'),
+    "scale": (CAMERA + BALL + "scale = 0\n", "scale.*got 0, expected a number other than 0"),
     "rotate": (CAMERA + BALL + "rotate = { axis = [0, 0, 0], degrees = 1 }\n", "rotate.*axis other than 0"),
     "rotate key": (CAMERA + BALL + "rotate = { axis = [0, 0, 1], degree = 1 }\n", 'rotate.degree.*"degrees"'),
     "matrix": (CAMERA + BALL + "matrix = [[1, 0], [0, 1]]\n", "matrix.*expected 4 rows of 4 numbers"),
     "matrix flat": (CAMERA + BALL + f"matrix = {[[1, 0, 0, 0]] * 3 + [[0, 0, 0, 1]]}\n", "matrix.*invertible"),
-    "matrix too": (CAMERA + BALL + f"scale = 1\nmatrix = {np.eye(4).tolist()}\n", "matrix.*found scale as well"),
-    "same name": (CAMERA + BALL + BALL, r'object\[1\].name: found "ball", which object\[0\] has too'),
+    "matrix too": (CAMERA + BALL + f"scale = 1\nmatrix = {np.eye(4).tolist()}\n", "matrix.*got scale as well"),
+    "same name": (CAMERA + BALL + BALL, r'object\[1\].name: got "ball", which object\[0\] has too'),
     "camera name": (
         CAMERA + '[[object]]\nname = "camera"\nprimitive = "cube"\n',
-        r'object\[0\].name: found "camera", expected another',
+        r'object\[0\].name: got "camera", expected another',
     ),
     "blank name": (CAMERA + '[[object]]\nname = ""\nprimitive = "cube"\n', "name.*not blank"),
     "normals": (CAMERA + BALL + 'normals = "smoth"\n', "normals.*did you mean"),
-    "no mesh": (CAMERA + '[[object]]\nmesh = "trii.obj"\n', r'mesh: found no such file at .*did you mean "tri.obj"'),
-    "kind": (CAMERA + '[[object]]\nmesh = "scene.toml"\n', r"mesh: found the mesh file .* of an unknown kind.*\.ply"),
+    "no mesh": (CAMERA + '[[object]]\nmesh = "trii.obj"\n', r'mesh: got no such file at .*did you mean "tri.obj"'),
+    "kind": (CAMERA + '[[object]]\nmesh = "scene.toml"\n', r"mesh: got the mesh file .* of an unknown kind.*\.ply"),
     "asset": (
         CAMERA + '[[object]]\nmesh = "warp:buny.usd"\n',
-        r'mesh: found no "buny.usd".*did you mean "bunny.usd"\?',
+        r'mesh: got no "buny.usd".*did you mean "bunny.usd"\?',
     ),
-    "empty mesh": (CAMERA + '[[object]]\nmesh = "points.obj"\n', "mesh: found no faces in"),
-    "broken mesh": (CAMERA + '[[object]]\nmesh = "broken.ply"\n', "mesh: found a ply file that cannot be read"),
-    "texture": (CAMERA + BALL + 'texture = "no.png"\n', "texture.*found no such file"),
+    "empty mesh": (CAMERA + '[[object]]\nmesh = "points.obj"\n', "mesh: got no faces in"),
+    "broken mesh": (CAMERA + '[[object]]\nmesh = "broken.ply"\n', "mesh: got a ply file that cannot be read"),
+    "texture": (CAMERA + BALL + 'texture = "no.png"\n', "texture.*got no such file"),
     "texture kind": (CAMERA + BALL + 'texture = "tri.obj"\n', "texture.*an image that cannot be read"),
     "no uv": (CAMERA + '[[object]]\nmesh = "tri.obj"\ntexture = "a.png"\n', "texture.*without texture coordinates"),
 }
@@ -198,7 +198,7 @@ COMPLAINTS = {
 
 @pytest.mark.parametrize("case", COMPLAINTS)
 def test_complaints(tmp_path, case):
-    """One line: the file, the key, what was found, what is expected."""
+    """One line: the file, the key, what was got, what is expected."""
     write(tmp_path, TRIANGLE, "tri.obj")
     write(tmp_path, "v 0 0 0\nv 1 1 1\n", "points.obj")
     write(tmp_path, "ply\nformat ascii 1.0\nelement vertex 3\nnonsense\n", "broken.ply")
@@ -213,7 +213,7 @@ def test_complaints(tmp_path, case):
 
 def test_missing_scene_file(tmp_path):
     """A scene that is not there is named."""
-    with pytest.raises(SceneError, match=r"nothing.toml: found no such file"):
+    with pytest.raises(SceneError, match=r"nothing.toml: got no such file"):
         load_scene(tmp_path / "nothing.toml")
     (tmp_path / "bytes.toml").write_bytes(b"beta = \xff")
     with pytest.raises(SceneError, match="not UTF-8"):

@@ -8,10 +8,12 @@ import warp as wp
 from capture_scenes import orthographic, perspective, pixels_of, quad, rays_through, scene, soup, surface
 from scipy.spatial import Delaunay
 
-from warpfrag.capture.capture import capture
+from warpfrag.capture.coverage import capture
 from warpfrag.raster.ray import Window
-from warpfrag.raster.triangles import count_fragments, prepare_triangles, scan_counts, sort_fragments, store_fragments
+from warpfrag.raster.triangles import prepare_triangles
 from warpfrag.shapes.primitives import sphere, torus
+from warpfrag.storage.lists import DYNAMIC, sort_lists
+from warpfrag.storage.method import Room, count_fragments, fill, scan_counts
 
 
 def counts_of(points, faces, camera, rows=None) -> np.ndarray:
@@ -230,10 +232,10 @@ def test_a_thread_per_triangle_stores_the_same_fragments(monkeypatch):
     by_bands = prepare_triangles(points, wp.array(item.faces, device="cpu"), Window.of(perspective((40, 40))))
     found = []
     for triangles in (by_bands, replace(by_bands, listed=None, band_begins=None)):
-        offsets, total = scan_counts(count_fragments(triangles))
-        faces, depths = store_fragments(triangles, offsets, total, True)
-        sort_fragments(offsets, faces, depths)
-        found.append([array.numpy() for array in (offsets, faces, depths)])
+        room = Room(1600, wp.float32, points.device, lambda *told: None, counts=count_fragments(triangles))
+        lists = fill(DYNAMIC, triangles, room)
+        sort_lists(lists)
+        found.append([array.numpy() for array in (lists.offsets, lists.items, lists.depths)])
     assert found[0][0][-1] > 500
     for one, other in zip(*found, strict=True):
         np.testing.assert_array_equal(one, other)

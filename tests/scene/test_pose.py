@@ -6,7 +6,7 @@ import torch
 from capture_scenes import orthographic, perspective, pixels_of, quad, scene, soup, surface
 
 from warpfrag.capture.bounded import capture_kbuffer
-from warpfrag.capture.capture import capture
+from warpfrag.capture.coverage import capture
 from warpfrag.render import render
 from warpfrag.scene.assemble import assemble
 from warpfrag.scene.camera import Camera

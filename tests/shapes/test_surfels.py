@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 import warpfrag as wf
-from warpfrag.shapes.surfels import PointSet, estimate_normals, load_points, spacing, surfels
+from warpfrag.files.points import load_points
+from warpfrag.shapes.surfels import PointSet, estimate_normals, spacing, surfels
 
 HALF = 0.21586050011389926  # 128/255 in sRGB, in linear light
 CAMERA = "[camera]\neye = [0, 0, 3]\ntarget = [0, 0, 0]\nheight = 2.0\nsize = [64, 64]\n"
@@ -171,13 +172,13 @@ def test_gradients_reach_the_colours_of_discs(tmp_path):
     ("name", "text", "words"),
     [
         ("a.txt", "1 2 3\n", "unknown kind, expected one of .ply, .pts, .pwn, .xyz"),
-        ("a.xyz", "", "found no points in"),
+        ("a.xyz", "", "got no points in"),
         ("a.xyz", "1 2 3 4 5\n", "5 columns, expected 3, 4, 6, 7 or 9"),
         ("a.xyz", "1 2 three\n", "cannot be read: .*three"),
         ("a.xyz", "1 2 nan\n", "a position is not finite"),
         ("a.xyz", "1 2 3 300 0 0\n", "a colour is out of its range"),
-        ("a.xyz", "1 2 3\n1 2 3\n", "found 1 distinct points, expected at least 2"),
-        ("a.ply", "ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n", "found no points"),
+        ("a.xyz", "1 2 3\n1 2 3\n", "got 1 distinct points, expected at least 2"),
+        ("a.ply", "ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n", "got no points"),
         ("a.ply", "no ply", "cannot be read"),
     ],
 )
@@ -192,12 +193,12 @@ def test_refused_files(tmp_path, name, text, words):
 @pytest.mark.parametrize(
     ("keys", "words"),
     [
-        ('points = "b.xyz"\n', "points: found no such file at"),
-        ('points = "../b.xyz"\n', 'points: found "../b.xyz", outside of'),
-        ('points = "a.xyz"\nradius = 0\n', "radius: found 0, expected a number above 0"),
-        ('points = "a.xyz"\nsegments = 2\n', "segments: found 2, expected a whole number from 3 to 64"),
-        ('points = "a.xyz"\nnormals = "flat"\n', "normals: found an unknown key of points"),
-        ('points = "a.xyz"\nprimitive = "cube"\n', "found both primitive and points, expected mesh, primitive or"),
+        ('points = "b.xyz"\n', "points: got no such file at"),
+        ('points = "../b.xyz"\n', 'points: got "../b.xyz", outside of'),
+        ('points = "a.xyz"\nradius = 0\n', "radius: got 0, expected a number above 0"),
+        ('points = "a.xyz"\nsegments = 2\n', "segments: got 2, expected a whole number from 3 to 64"),
+        ('points = "a.xyz"\nnormals = "flat"\n', "normals: got an unknown key of points"),
+        ('points = "a.xyz"\nprimitive = "cube"\n', "got both primitive and points, expected mesh, primitive or"),
     ],
 )
 def test_refused_keys(tmp_path, keys, words):

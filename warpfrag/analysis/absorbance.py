@@ -7,17 +7,17 @@ product holds for overlapping slabs too: however parts are mixed, their transmit
 is the function that merging approximates, and for layers what it came to (Fig. 13 of the fragment-merging paper).
 """
 
-import math
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from warpfrag.arrays.legacy import kind_of
-from warpfrag.fragments import Fragments, Layers
-from warpfrag.resolve.arguments import MIXES, Merge, Mix, check_choice
+from warpfrag.arrays.kinds import kind_of
+from warpfrag.errors import check_choice
+from warpfrag.fragments import Fragments, Layers, pixel_number
 from warpfrag.resolve.resolve import resolve
+from warpfrag.scene.names import MIXES, Merge, Mix
 
 # Least transmittance of a slab that is divided, and the number of intervals that draw the curve inside of one.
 _FLOOR = 1e-6
@@ -88,11 +88,11 @@ def absorbance(
     """
     if not isinstance(source, (Fragments, Layers)):
         raise TypeError(f"source: got {type(source).__name__}, expected Fragments or Layers")
-    check_choice("mix", mix, tuple(MIXES))
-    number = _pixel_number(pixel, source.shape)
+    check_choice("mix", mix, MIXES)
+    number = pixel_number(pixel, source.shape)
     if isinstance(source, Layers):
         if merge is not None:
-            raise TypeError("merge: goes with Fragments only, layers are merged")
+            raise TypeError("merge: got it with Layers, expected Fragments (layers are merged already)")
         slabs, betas = layers_of_pixel(source, pixel), _beta_of_pixel(beta, source, number)
     else:
         slabs, betas = fragments_of_pixel(source, pixel), _beta_of_pixel(beta, source, number)
@@ -104,13 +104,13 @@ def absorbance(
             betas = np.full(slabs.count, one)
     order = np.argsort(slabs.depth, kind="stable")
     ordered = {"rgba": slabs.rgba[order], "depth": slabs.depth[order], "thickness": slabs.thickness[order]}
-    slabs = Fragments(**ordered, offsets=slabs.offsets, shape=(1,))
+    slabs = Fragments(**ordered, offsets=slabs.offsets, shape=(1, 1))
     floor = 0.0 if mix == "optical_depth" else _FLOOR
     return _trace(slabs, np.broadcast_to(betas, (slabs.count,))[order], floor)
 
 
 def fragments_of_pixel(fragments: Fragments, pixel: tuple[int, ...] | int) -> Fragments:
-    """Return the fragments of one pixel, in the order they have, as NumPy float64 of shape (1,).
+    """Return the fragments of one pixel, in the order they have, as NumPy float64 of shape (1, 1).
 
     Args:
         fragments: those of all pixels.
@@ -119,16 +119,11 @@ def fragments_of_pixel(fragments: Fragments, pixel: tuple[int, ...] | int) -> Fr
     Raises:
         ValueError: there is no such pixel.
     """
-    number = _pixel_number(pixel, fragments.shape)
-    begin, end = (int(bound) for bound in _numpy(fragments.offsets[number : number + 2]))
-    names = ("rgba", "depth", "thickness", "opacity_sum", "object_id", "primitive_id")
-    arrays = {name: getattr(fragments, name) for name in names}
-    parts = {name: None if array is None else _numpy(array[begin:end]) for name, array in arrays.items()}
-    return Fragments(**parts, offsets=np.array([0, end - begin], np.int32), shape=(1,))
+    return fragments[pixel].numpy().to("float64")
 
 
 def layers_of_pixel(layers: Layers, pixel: tuple[int, ...] | int) -> Fragments:
-    """Return the layers of one pixel as fragments, NumPy float64 of shape (1,).
+    """Return the layers of one pixel as fragments, NumPy float64 of shape (1, 1).
 
     Args:
         layers: those of all pixels.
@@ -137,38 +132,24 @@ def layers_of_pixel(layers: Layers, pixel: tuple[int, ...] | int) -> Fragments:
     Raises:
         ValueError: there is no such pixel.
     """
-    number = _pixel_number(pixel, layers.shape)
-    pixel_count, most = math.prod(layers.shape), layers.max_layers
-    count = int(_numpy(layers.count.reshape((pixel_count,))[number : number + 1])[0])
-
-    def values(array: Any, *channels: int) -> np.ndarray:
-        return _numpy(array.reshape((pixel_count, most, *channels))[number : number + 1])[0, :count]
-
-    rgba, depth, thickness = values(layers.rgba, 4), values(layers.depth), values(layers.thickness)
-    return Fragments(rgba, depth, thickness, np.array([0, count], np.int32), (1,))
-
-
-def _pixel_number(pixel: Any, shape: tuple[int, ...]) -> int:
-    index = tuple(pixel) if isinstance(pixel, (tuple, list)) else (pixel,)
-    sizes = shape if isinstance(pixel, (tuple, list)) else (math.prod(shape),)
-    whole = all(isinstance(at, (int, np.integer)) and not isinstance(at, bool) for at in index)
-    if not whole or len(index) != len(sizes) or not all(0 <= at < size for at, size in zip(index, sizes, strict=True)):
-        raise ValueError(f"pixel: got {pixel!r}, expected an index into the pixel grid {shape}")
-    return int(np.ravel_multi_index(index, sizes))
+    own = layers[pixel].numpy().to("float64")
+    count = int(own.count[0, 0])
+    rgba, depth, thickness = (array[0, 0, :count] for array in (own.rgba, own.depth, own.thickness))
+    return Fragments(rgba, depth, thickness, np.array([0, count], np.int32), (1, 1))
 
 
 def _beta_of_pixel(beta: Any, source: Fragments | Layers, number: int) -> np.ndarray:
     """Return beta of one pixel, or of each of its fragments."""
-    values = np.asarray(_numpy(beta) if kind_of(beta) else beta, np.float64)
+    kind = kind_of(beta)
+    values = np.asarray(beta if kind is None else kind.to_numpy(beta), np.float64)
     if values.shape == tuple(source.shape):
         values = values.reshape(-1)[number : number + 1]
     elif isinstance(source, Fragments) and values.shape == (source.count,):
-        begin, end = (int(bound) for bound in _numpy(source.offsets[number : number + 2]))
-        values = values[begin:end]
+        values = values[source.pixel == number]
     elif values.size != 1:
         raise ValueError(f"beta: got shape {values.shape}, expected () or {tuple(source.shape)}")
     if not np.all((values >= 0.0) & (values <= 1.0)):
-        raise ValueError(f"beta: got {beta}, expected values from 0 to 1")
+        raise ValueError(f"beta: got {beta}, expected numbers from 0 to 1")
     return values.reshape(-1)
 
 
@@ -204,13 +185,3 @@ def _absorbance(slabs: Fragments, beta: np.ndarray, floor: float, depth: np.ndar
         inside = b * (1.0 - r * a) + (1.0 - b) * optical
         transmittance *= np.where(passed, 1.0 - a, np.where(entered, inside, 1.0))
     return 1.0 - transmittance
-
-
-def _numpy(array: Any) -> np.ndarray:
-    """Return an array of any kind in NumPy; floating-point numbers as float64."""
-    kind = kind_of(array)
-    if kind == "torch":
-        array = array.detach().cpu().numpy()
-    elif kind == "warp":
-        array = array.numpy()
-    return array.astype(np.float64) if array.dtype.kind == "f" else array

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from warpfrag.analysis.absorbance import Absorbance, absorbance, fragments_of_pixel
-from warpfrag.capture.capture import capture
+from warpfrag.capture.coverage import capture
+from warpfrag.colors import linear_to_srgb
 from warpfrag.extras import need
-from warpfrag.files.images import linear_to_srgb
 from warpfrag.files.saving import replacing
 from warpfrag.fragments import Fragments
 from warpfrag.scene.scene import Scene
@@ -138,7 +138,7 @@ def inspect_pixel(scene: Scene, column: int, row: int) -> Inspection:
     """
     height, width = scene.camera.shape
     if not (0 <= column < width and 0 <= row < height):
-        raise ValueError(f"pixel: found {column},{row}, expected a column below {width} and a row below {height}")
+        raise ValueError(f"pixel: got {column},{row}, expected a column below {width} and a row below {height}")
     captured = capture(scene, rows=(row, row + 1))
     every = absorbance(captured, (0, column), scene.beta, mix=scene.mix)
     merged = absorbance(captured, (0, column), scene.beta, merge=scene.merge, max_layers=scene.layers, mix=scene.mix)

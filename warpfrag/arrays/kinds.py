@@ -7,8 +7,6 @@ A further library is a file with one more `Kind`, named in `LIBRARIES`.
 import sys
 from collections.abc import Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext
-from functools import cache
-from importlib import import_module
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,9 +14,6 @@ import numpy as np
 import warp as wp
 
 from warpfrag.arrays.operator import Operator, empty_outputs, named
-
-# Where the kinds of other libraries are; a library that nobody has imported has no arrays, and stays unloaded.
-LIBRARIES = {"torch": "warpfrag.arrays.torch_ops"}
 
 
 class Kind:
@@ -210,14 +205,20 @@ def kind_of(array: Any) -> Kind | None:
         if kind.owns(array):
             return kind
     for library in LIBRARIES:
-        if library in sys.modules and _library_kind(library).owns(array):
-            return _library_kind(library)
+        if library in sys.modules and LIBRARIES[library]().owns(array):
+            return LIBRARIES[library]()
     return None
 
 
-@cache
-def _library_kind(library: str) -> Kind:
-    return import_module(LIBRARIES[library]).KIND
+def _torch_kind() -> Kind:
+    from warpfrag.arrays import torch_ops
+
+    return torch_ops.KIND
+
+
+# The kinds of other libraries. One that nobody has imported has no arrays, and stays unloaded. (Import statements, as
+# torch.compile follows those.)
+LIBRARIES = {"torch": _torch_kind}
 
 
 def kind_named(name: str) -> Kind:
@@ -229,7 +230,7 @@ def kind_named(name: str) -> Kind:
     for kind in (NUMPY, WARP):
         if kind.name == name:
             return kind
-    return _library_kind(name)
+    return LIBRARIES[name]()
 
 
 def common_kind(arrays: Mapping[str, Any]) -> Kind:

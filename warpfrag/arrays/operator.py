@@ -6,7 +6,7 @@ for what the options say in their `sizes`.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from types import SimpleNamespace
 from typing import Any, Literal
 
@@ -63,6 +63,8 @@ class Operator:
         options: a frozen dataclass of numbers and texts; a method `sizes` may say what names in shapes are.
         tables: arrays of the library's own that a call takes as well: Warp arrays whatever the kind of the inputs; they
             have no gradient.
+        arguments: all array arguments: inputs, then tables.
+        option_names: the names of the options, in order.
     """
 
     name: str
@@ -72,21 +74,16 @@ class Operator:
     backward: Callable[..., None] | None = None
     options: type = NoOptions
     tables: tuple[Input, ...] = ()
+    arguments: tuple[Input, ...] = field(init=False)
+    option_names: tuple[str, ...] = field(init=False)
 
     def __post_init__(self):
+        # Once: torch.compile cannot look at the fields of a class.
+        object.__setattr__(self, "arguments", (*self.inputs, *self.tables))
+        object.__setattr__(self, "option_names", tuple(option.name for option in fields(self.options)))
         OPERATORS[self.name] = self
         for register in LISTENERS:
             register(self)
-
-    @property
-    def arguments(self) -> tuple[Input, ...]:
-        """All array arguments: inputs, then tables."""
-        return (*self.inputs, *self.tables)
-
-    @property
-    def option_names(self) -> tuple[str, ...]:
-        """The names of the options, in order."""
-        return tuple(option.name for option in fields(self.options))
 
     def output_shapes(self, arrays: SimpleNamespace, options: Any) -> list[Shape]:
         """Return the shapes of the outputs, from those of the inputs and the options alone."""

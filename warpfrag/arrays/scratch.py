@@ -1,6 +1,6 @@
-"""Scratch memory: rows of arrays that belong to a thread each, sized from the fields of a structure."""
+"""Scratch memory: rows of arrays that belong to a thread each, allocated from the fields of a structure."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Any
 
 import warp as wp
@@ -9,20 +9,36 @@ import warp as wp
 ROW_GAP = 32
 
 
-def field_types(structure: Any, names: Iterable[str] | None = None) -> dict[str, Any]:
-    """Return the element types of a structure's array fields by name, of all or of some."""
-    arrays = {name: field.type for name, field in structure.vars.items() if isinstance(field.type, wp.array)}
-    return {name: arrays[name].dtype for name in (arrays if names is None else names)}
+def _element_types(scratch: Any, names: Iterable[str] | None) -> dict[str, Any]:
+    fields = {name: field.type for name, field in scratch._cls.vars.items() if isinstance(field.type, wp.array)}
+    return {name: fields[name].dtype for name in (fields if names is None else names)}
 
 
-def row_bytes(structure: Any, lengths: Mapping[str, int]) -> int:
-    """Return the memory of one thread's rows [bytes], given the length of each array's."""
-    types = field_types(structure, lengths)
-    return sum(length * wp.types.type_size_in_bytes(types[name]) for name, length in lengths.items())
+def row_bytes(scratch: Any, length: int, names: Iterable[str] | None = None, twice: Iterable[str] = ()) -> int:
+    """Return the memory of a thread's rows [bytes]; see `fill_rows`."""
+    types = _element_types(scratch, names)
+    double = set(twice)
+    return sum((2 if name in double else 1) * length * wp.types.type_size_in_bytes(t) for name, t in types.items())
 
 
-def fill_rows(scratch: Any, rows: int, lengths: Mapping[str, int], device: wp.Device) -> None:
-    """Give arrays of a structure so many rows, of the given lengths, one after the other."""
-    types = field_types(scratch._cls, lengths)
-    for name, length in lengths.items():
-        setattr(scratch, name, wp.empty(rows * length, dtype=types[name], device=device))
+def fill_rows(
+    scratch: Any,
+    rows: int,
+    length: int,
+    device: wp.Device,
+    names: Iterable[str] | None = None,
+    twice: Iterable[str] = (),
+) -> None:
+    """Allocate the arrays of a structure: so many rows, one after the other.
+
+    Args:
+        scratch: the structure.
+        rows: number of rows, one for each thread.
+        length: entries of a row.
+        device: where.
+        names: which of its arrays; None for all.
+        twice: those whose rows have twice the length.
+    """
+    double = set(twice)
+    for name, dtype in _element_types(scratch, names).items():
+        setattr(scratch, name, wp.empty(rows * length * (2 if name in double else 1), dtype=dtype, device=device))

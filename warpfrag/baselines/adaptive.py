@@ -14,47 +14,69 @@ A second pass blends, C = sum_i C_i v(z_i). The image is exact if no node had to
 """
 
 from collections.abc import Sequence
-from functools import cache
+from dataclasses import dataclass
 from typing import Any
 
 import warp as wp
 
 from warpfrag.arrays.launch import Span
-from warpfrag.baselines.inputs import check_whole, exact_image
-from warpfrag.baselines.stream import stream, stream_operator
+from warpfrag.arrays.precisions import kernels
+from warpfrag.baselines.inputs import exact_image
+from warpfrag.baselines.sequential import blend, sequential_operator
+from warpfrag.errors import check_whole
 from warpfrag.fragments import Fragments
 
 wp.set_module_options({"enable_backward": False})
 
 
-@cache
-def _kernel(scalar: Any) -> wp.Kernel:
-    vec4 = wp.types.vector(4, scalar)
+@dataclass(frozen=True)
+class AdaptiveOptions:
+    """Number of nodes, and the first that may be removed."""
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def adaptive_fwd(
+    nodes: int
+    first_removed: int
+
+
+@kernels
+def adaptive_fwd(number: Any) -> Any:
+    """Return the kernel."""
+    vec4 = wp.types.vector(4, number)
+
+    def kernel(
         span: Span,
         rgba: wp.array(dtype=vec4),
-        depth: wp.array(dtype=scalar),
+        depth: wp.array(dtype=number),
         offsets: wp.array(dtype=int),
-        exact: wp.array(dtype=vec4),
         node_count: int,
         first_removed: int,
-        node_depth: wp.array2d(dtype=scalar),
-        node_through: wp.array2d(dtype=scalar),
+        node_depth: wp.array2d(dtype=number),
+        node_through: wp.array2d(dtype=number),
         image: wp.array(dtype=vec4),
     ):
+        """Compress the visibility of each pixel, then blend by it.
+
+        Args:
+            span: pixels.
+            rgba: colour and opacity of the fragments, (F,).
+            depth: depth of the fragments [scene units], (F,).
+            offsets: where each pixel's fragments begin, (P + 1,).
+            node_count: most nodes N.
+            first_removed: first node that may be removed.
+            node_depth: scratch memory: depths of the nodes, (threads, N + 1).
+            node_through: scratch memory: what is visible behind them, (threads, N + 1).
+            image: output, (P,).
+        """
         row = span.worker + wp.tid()
         for pixel in range(span.begin + wp.tid(), span.end, span.stride):
             used = int(0)
             for fragment in range(offsets[pixel], offsets[pixel + 1]):
-                passed = scalar(1.0) - rgba[fragment][3]
+                passed = number(1.0) - rgba[fragment][3]
                 slot = int(used)
                 while slot > 0 and node_depth[row, slot - 1] >= depth[fragment]:
                     node_depth[row, slot] = node_depth[row, slot - 1]
                     node_through[row, slot] = node_through[row, slot - 1] * passed
                     slot -= 1
-                before = scalar(1.0)
+                before = number(1.0)
                 if slot > 0:
                     before = node_through[row, slot - 1]
                 node_depth[row, slot] = depth[fragment]
@@ -62,7 +84,7 @@ def _kernel(scalar: Any) -> wp.Kernel:
                 used += 1
                 if used > node_count:
                     removed = int(first_removed)
-                    least = scalar(wp.inf)
+                    least = number(wp.inf)
                     for k in range(first_removed, used):
                         drop = node_through[row, k - 1] - node_through[row, k]
                         area = (node_depth[row, k] - node_depth[row, k - 1]) * drop
@@ -76,24 +98,24 @@ def _kernel(scalar: Any) -> wp.Kernel:
                     used -= 1
             color = vec4()
             for fragment in range(offsets[pixel], offsets[pixel + 1]):
-                visible = scalar(1.0)
+                visible = number(1.0)
                 for k in range(used):
                     if node_depth[row, k] < depth[fragment]:
                         visible = node_through[row, k]
                 color += visible * rgba[fragment]
-            opacity = scalar(0.0)
+            opacity = number(0.0)
             if used > 0:
-                opacity = scalar(1.0) - node_through[row, used - 1]
+                opacity = number(1.0) - node_through[row, used - 1]
             image[pixel] = vec4(color[0], color[1], color[2], opacity)
 
-    return adaptive_fwd
+    return kernel
 
 
-def _nodes(scalar: Any, nodes: int, first_removed: int) -> Sequence[tuple[Any, int]]:
-    return [(scalar, nodes + 1), (scalar, nodes + 1)]
+def _nodes(number: Any, options: AdaptiveOptions) -> Sequence[tuple[Any, int]]:
+    return [(number, options.nodes + 1), (number, options.nodes + 1)]
 
 
-_ADAPTIVE = stream_operator("adaptive_transparency", _kernel, _nodes, {"nodes": "int", "first_removed": "int"})
+_ADAPTIVE = sequential_operator("adaptive_transparency", adaptive_fwd, _nodes, AdaptiveOptions)
 
 
 def adaptive_transparency(fragments: Fragments, *, nodes: int = 8, keep_near: bool = False) -> Any:
@@ -115,4 +137,4 @@ def adaptive_transparency(fragments: Fragments, *, nodes: int = 8, keep_near: bo
     """
     nodes = check_whole("nodes", nodes, 1)
     exact_image(fragments)
-    return stream(_ADAPTIVE, fragments, nodes=nodes, first_removed=max(1, nodes // 2) if keep_near else 1)
+    return blend(_ADAPTIVE, fragments, AdaptiveOptions(nodes, max(1, nodes // 2) if keep_near else 1))

@@ -12,45 +12,65 @@ The tail's n fragments count as n of equal opacity in the first. The image is ex
 """
 
 from collections.abc import Sequence
-from functools import cache
+from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 import warp as wp
 
 from warpfrag.arrays.launch import Span
-from warpfrag.baselines.inputs import check_whole, exact_image
-from warpfrag.baselines.stream import stream, stream_operator
+from warpfrag.arrays.precisions import kernels
+from warpfrag.baselines.inputs import exact_image
+from warpfrag.baselines.sequential import blend, sequential_operator
+from warpfrag.errors import check_choice, check_whole
 from warpfrag.fragments import Fragments
-from warpfrag.resolve.arguments import check_choice
 
 wp.set_module_options({"enable_backward": False})
 
 TailOpacity = Literal["average", "product"]
 
 
-@cache
-def _kernel(scalar: Any) -> wp.Kernel:
-    vec4 = wp.types.vector(4, scalar)
+@dataclass(frozen=True)
+class HybridOptions:
+    """Number of core fragments, and whether the tail's opacity is the product."""
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def hybrid_fwd(
+    core: int
+    product: bool
+
+
+@kernels
+def hybrid_fwd(number: Any) -> Any:
+    """Return the kernel."""
+    vec4 = wp.types.vector(4, number)
+
+    def kernel(
         span: Span,
         rgba: wp.array(dtype=vec4),
-        depth: wp.array(dtype=scalar),
+        depth: wp.array(dtype=number),
         offsets: wp.array(dtype=int),
-        exact: wp.array(dtype=vec4),
         core_count: int,
         product: bool,
         core: wp.array2d(dtype=int),
         image: wp.array(dtype=vec4),
     ):
+        """Composite the nearest fragments of each pixel, and average the others.
+
+        Args:
+            span: pixels.
+            rgba: colour and opacity of the fragments, (F,).
+            depth: depth of the fragments [scene units], (F,).
+            offsets: where each pixel's fragments begin, (P + 1,).
+            core_count: number of core fragments K.
+            product: whether the tail's opacity is the product.
+            core: scratch memory: the nearest fragments, (threads, K + 1).
+            image: output, (P,).
+        """
         row = span.worker + wp.tid()
-        one = scalar(1.0)
+        one = number(1.0)
         for pixel in range(span.begin + wp.tid(), span.end, span.stride):
             used = int(0)
             tail = vec4()
-            tail_count = scalar(0.0)
-            tail_through = scalar(1.0)
+            tail_count = number(0.0)
+            tail_through = number(1.0)
             for fragment in range(offsets[pixel], offsets[pixel + 1]):
                 slot = int(used)
                 while slot > 0 and depth[core[row, slot - 1]] > depth[fragment]:
@@ -65,28 +85,28 @@ def _kernel(scalar: Any) -> wp.Kernel:
                     tail_count += one
                     tail_through *= one - farthest[3]
             color = vec4()
-            through = scalar(1.0)
+            through = number(1.0)
             for slot in range(used):
                 color += through * rgba[core[row, slot]]
                 through *= one - rgba[core[row, slot]][3]
             opacity = one - tail_through
-            if not product and tail_count > scalar(0.0):
+            if not product and tail_count > number(0.0):
                 opacity = one - wp.pow(one - tail[3] / tail_count, tail_count)
             # As all opacities go to 0, so does the tail's, at the same pace.
             scale = one
-            if tail[3] > scalar(0.0):
+            if tail[3] > number(0.0):
                 scale = opacity / tail[3]
             color += (through * scale) * tail
             image[pixel] = vec4(color[0], color[1], color[2], one - through * (one - opacity))
 
-    return hybrid_fwd
+    return kernel
 
 
-def _nodes(scalar: Any, core: int, product: bool) -> Sequence[tuple[Any, int]]:
-    return [(wp.int32, core + 1)]
+def _nodes(number: Any, options: HybridOptions) -> Sequence[tuple[Any, int]]:
+    return [(wp.int32, options.core + 1)]
 
 
-_HYBRID = stream_operator("hybrid_transparency", _kernel, _nodes, {"core": "int", "product": "bool"})
+_HYBRID = sequential_operator("hybrid_transparency", hybrid_fwd, _nodes, HybridOptions)
 
 
 def hybrid_transparency(fragments: Fragments, *, core: int = 4, tail_opacity: TailOpacity = "average") -> Any:
@@ -109,4 +129,4 @@ def hybrid_transparency(fragments: Fragments, *, core: int = 4, tail_opacity: Ta
     core = check_whole("core", core, 0)
     check_choice("tail_opacity", tail_opacity, get_args(TailOpacity))
     exact_image(fragments)
-    return stream(_HYBRID, fragments, core=core, product=tail_opacity == "product")
+    return blend(_HYBRID, fragments, HybridOptions(core, tail_opacity == "product"))

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from warpfrag.arrays.kinds import common_kind
 from warpfrag.composite import composite
 from warpfrag.fragments import Fragments
 
@@ -22,25 +23,18 @@ def array_module(fragments: Fragments) -> Any:
     Raises:
         TypeError: they are Warp arrays, for which the method is not written.
     """
-    if fragments.kind == "warp":
+    xp = common_kind({"rgba": fragments.rgba}).xp
+    if xp is None:
         raise TypeError(
             "fragments: got Warp arrays, expected NumPy or torch (`fragments.numpy()`, `fragments.torch()`)"
         )
-    if fragments.kind == "numpy":
-        return np
-    import torch
-
-    return torch
+    return xp
 
 
 def owners(fragments: Fragments) -> Any:
     """Return the pixel that each fragment belongs to, (F,)."""
-    if fragments.kind == "numpy":
-        return fragments.pixel
-    import torch
-
-    counts = fragments.offsets.diff()
-    return torch.repeat_interleave(torch.arange(fragments.pixel_count, device=counts.device), counts)
+    kind = common_kind({"rgba": fragments.rgba})
+    return kind.asarray(fragments.pixel, fragments.offsets)
 
 
 def sum_pixels(values: Any, owner: Any, pixel_count: int) -> Any:
@@ -70,22 +64,12 @@ def range_of_depths(fragments: Fragments, depth_range: tuple[float, float] | Non
     if depth_range is None:
         if fragments.count == 0:
             return 1.0, 1.0
-        depth = fragments.depth.detach() if fragments.kind == "torch" else fragments.depth
+        depth = common_kind({"depth": fragments.depth}).detach(fragments.depth)
         near, far = float(depth.min()), float(depth.max())
         if near <= 0.0:
-            raise ValueError(f"fragments: the nearest depth is {near}, expected depths above 0 (or give depth_range)")
+            raise ValueError(f"fragments: got the nearest depth {near}, expected depths above 0 (or give depth_range)")
         return near, far
     near, far = (float(bound) for bound in depth_range)
     if not 0.0 < near <= far < math.inf:
         raise ValueError(f"depth_range: got {depth_range!r}, expected (near, far) with 0 < near <= far")
     return near, far
-
-
-def check_whole(name: str, value: Any, least: int, most: int | None = None) -> int:
-    """Return a whole number, or raise for anything else."""
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
-        raise TypeError(f"{name}: got {value!r}, expected a whole number of at least {least}")
-    if value < least or (most is not None and value > most):
-        bounds = f"of at least {least}" if most is None else f"from {least} to {most}"
-        raise ValueError(f"{name}: got {value}, expected a whole number {bounds}")
-    return int(value)

@@ -10,37 +10,58 @@ are full lies behind all that are kept.
 """
 
 from collections.abc import Sequence
-from functools import cache
+from dataclasses import dataclass
 from typing import Any
 
 import warp as wp
 
 from warpfrag.arrays.launch import Span
-from warpfrag.baselines.inputs import check_whole, exact_image
-from warpfrag.baselines.stream import stream, stream_operator
+from warpfrag.arrays.precisions import kernels
+from warpfrag.baselines.inputs import exact_image
+from warpfrag.baselines.sequential import blend, sequential_operator
+from warpfrag.errors import check_whole
 from warpfrag.fragments import Fragments
 
 wp.set_module_options({"enable_backward": False})
 
 
-@cache
-def _kernel(scalar: Any) -> wp.Kernel:
-    vec3 = wp.types.vector(3, scalar)
-    vec4 = wp.types.vector(4, scalar)
+@dataclass(frozen=True)
+class MultiLayerOptions:
+    """Number of nodes."""
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def multi_layer_fwd(
+    nodes: int
+
+
+@kernels
+def multi_layer_fwd(number: Any) -> Any:
+    """Return the kernel."""
+    vec3 = wp.types.vector(3, number)
+    vec4 = wp.types.vector(4, number)
+
+    def kernel(
         span: Span,
         rgba: wp.array(dtype=vec4),
-        depth: wp.array(dtype=scalar),
+        depth: wp.array(dtype=number),
         offsets: wp.array(dtype=int),
-        exact: wp.array(dtype=vec4),
         node_count: int,
-        node_depth: wp.array2d(dtype=scalar),
+        node_depth: wp.array2d(dtype=number),
         node_color: wp.array2d(dtype=vec3),
-        node_through: wp.array2d(dtype=scalar),
+        node_through: wp.array2d(dtype=number),
         image: wp.array(dtype=vec4),
     ):
+        """Blend each pixel into its nodes.
+
+        Args:
+            span: pixels.
+            rgba: colour and opacity of the fragments, (F,).
+            depth: depth of the fragments [scene units], (F,).
+            offsets: where each pixel's fragments begin, (P + 1,).
+            node_count: most nodes N.
+            node_depth: scratch memory: depths of the nodes, (threads, N + 1).
+            node_color: scratch memory: their colours.
+            node_through: scratch memory: their transmittances.
+            image: output, (P,).
+        """
         row = span.worker + wp.tid()
         for pixel in range(span.begin + wp.tid(), span.end, span.stride):
             used = int(0)
@@ -54,7 +75,7 @@ def _kernel(scalar: Any) -> wp.Kernel:
                 c = rgba[fragment]
                 node_depth[row, slot] = depth[fragment]
                 node_color[row, slot] = vec3(c[0], c[1], c[2])
-                node_through[row, slot] = scalar(1.0) - c[3]
+                node_through[row, slot] = number(1.0) - c[3]
                 used += 1
                 if used > node_count:
                     last = used - 2
@@ -63,20 +84,21 @@ def _kernel(scalar: Any) -> wp.Kernel:
                     node_through[row, last] = node_through[row, last] * node_through[row, last + 1]
                     used -= 1
             color = vec3()
-            through = scalar(1.0)
+            through = number(1.0)
             for slot in range(used):
                 color += through * node_color[row, slot]
                 through *= node_through[row, slot]
-            image[pixel] = vec4(color[0], color[1], color[2], scalar(1.0) - through)
+            image[pixel] = vec4(color[0], color[1], color[2], number(1.0) - through)
 
-    return multi_layer_fwd
-
-
-def _nodes(scalar: Any, nodes: int) -> Sequence[tuple[Any, int]]:
-    return [(scalar, nodes + 1), (wp.types.vector(3, scalar), nodes + 1), (scalar, nodes + 1)]
+    return kernel
 
 
-_MULTI_LAYER = stream_operator("multi_layer_alpha_blending", _kernel, _nodes, {"nodes": "int"})
+def _nodes(number: Any, options: MultiLayerOptions) -> Sequence[tuple[Any, int]]:
+    length = options.nodes + 1
+    return [(number, length), (wp.types.vector(3, number), length), (number, length)]
+
+
+_MULTI_LAYER = sequential_operator("multi_layer_alpha_blending", multi_layer_fwd, _nodes, MultiLayerOptions)
 
 
 def multi_layer_alpha_blending(fragments: Fragments, *, nodes: int = 4) -> Any:
@@ -97,4 +119,4 @@ def multi_layer_alpha_blending(fragments: Fragments, *, nodes: int = 4) -> Any:
     """
     nodes = check_whole("nodes", nodes, 1)
     exact_image(fragments)
-    return stream(_MULTI_LAYER, fragments, nodes=nodes)
+    return blend(_MULTI_LAYER, fragments, MultiLayerOptions(nodes))

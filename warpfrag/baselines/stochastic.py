@@ -11,28 +11,38 @@ less noise, at the price of a small bias.
 """
 
 from collections.abc import Sequence
-from functools import cache
+from dataclasses import dataclass
 from typing import Any
 
 import warp as wp
 
 from warpfrag.arrays.launch import Span
-from warpfrag.baselines.inputs import check_whole, exact_image
-from warpfrag.baselines.stream import stream, stream_operator
+from warpfrag.arrays.precisions import kernels
+from warpfrag.baselines.inputs import exact_image
+from warpfrag.baselines.sequential import blend, sequential_operator
+from warpfrag.errors import check_whole
 from warpfrag.fragments import Fragments
 
 wp.set_module_options({"enable_backward": False})
 
 
-@cache
-def _kernel(scalar: Any) -> wp.Kernel:
-    vec4 = wp.types.vector(4, scalar)
+@dataclass(frozen=True)
+class StochasticOptions:
+    """Number of samples, and the seed."""
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def stochastic_fwd(
+    samples: int
+    seed: int
+
+
+@kernels
+def stochastic_fwd(number: Any) -> Any:
+    """Return the kernel."""
+    vec4 = wp.types.vector(4, number)
+
+    def kernel(
         span: Span,
         rgba: wp.array(dtype=vec4),
-        depth: wp.array(dtype=scalar),
+        depth: wp.array(dtype=number),
         offsets: wp.array(dtype=int),
         exact: wp.array(dtype=vec4),
         sample_count: int,
@@ -40,6 +50,19 @@ def _kernel(scalar: Any) -> wp.Kernel:
         nearest: wp.array2d(dtype=int),
         image: wp.array(dtype=vec4),
     ):
+        """Let fragments cover samples of each pixel.
+
+        Args:
+            span: pixels.
+            rgba: colour and opacity of the fragments, (F,).
+            depth: depth of the fragments [scene units], (F,).
+            offsets: where each pixel's fragments begin, (P + 1,).
+            exact: image of plain over, (P,), or empty.
+            sample_count: number of samples S.
+            seed: of the draws.
+            nearest: scratch memory: the nearest fragment of each sample, (threads, S).
+            image: output, (P,).
+        """
         row = span.worker + wp.tid()
         for pixel in range(span.begin + wp.tid(), span.end, span.stride):
             random = wp.rand_init(seed, pixel)
@@ -60,22 +83,24 @@ def _kernel(scalar: Any) -> wp.Kernel:
                 if nearest[row, sample] >= 0:
                     seen = rgba[nearest[row, sample]]
                     sum += seen / seen[3]
-            sum /= scalar(sample_count)
+            sum /= number(sample_count)
             if exact.shape[0] > 0:
                 opacity = exact[pixel][3]
-                if sum[3] > scalar(0.0):
+                if sum[3] > number(0.0):
                     sum *= opacity / sum[3]
                 sum[3] = opacity
             image[pixel] = sum
 
-    return stochastic_fwd
+    return kernel
 
 
-def _nodes(scalar: Any, samples: int, seed: int) -> Sequence[tuple[Any, int]]:
-    return [(wp.int32, samples)]
+def _nodes(number: Any, options: StochasticOptions) -> Sequence[tuple[Any, int]]:
+    return [(wp.int32, options.samples)]
 
 
-_STOCHASTIC = stream_operator("stochastic_transparency", _kernel, _nodes, {"samples": "int", "seed": "int"})
+_STOCHASTIC = sequential_operator(
+    "stochastic_transparency", stochastic_fwd, _nodes, StochasticOptions, takes_exact=True
+)
 
 
 def stochastic_transparency(
@@ -101,4 +126,4 @@ def stochastic_transparency(
     samples = check_whole("samples", samples, 1)
     seed = check_whole("seed", seed, 0, 2**31 - 1)
     exact = exact_image(fragments)
-    return stream(_STOCHASTIC, fragments, exact if alpha_correction else None, samples=samples, seed=seed)
+    return blend(_STOCHASTIC, fragments, StochasticOptions(samples, seed), exact if alpha_correction else None)

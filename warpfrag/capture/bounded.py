@@ -7,154 +7,191 @@ Gradients are those of `resolve.kbuffer` and of `capture.shade`. The way back ne
 again, in bands of rows that take `BAND_BYTES` (or one row): between the passes nothing is kept but the scene.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
+from types import SimpleNamespace
 from typing import Any, Literal, get_args
 
 import numpy as np
 import warp as wp
 
-from warpfrag.arrays.legacy import Operator, add, apply
-from warpfrag.capture.capture import Surfaces, as_kind, check_scene, place_surfaces, to_warp
-from warpfrag.capture.into_slots import TALLY_ALL, TALLY_BEHIND, TALLY_OCCUPANCY, TALLY_ROWS, stream_triangles
+from warpfrag.arrays.apply import apply
+from warpfrag.arrays.kinds import add_in_place
+from warpfrag.arrays.operator import Input, Operator, empty_outputs
+from warpfrag.capture.interpolation import hit_of, shade_color, shade_thickness
 from warpfrag.capture.memory import allowed_memory, fragment_bytes, refuse, split_rows
-from warpfrag.capture.shade import SHADE_DIFFERENTIABLE, SHADE_OPTIONS, SHADE_TENSORS, shade_forward, shade_output_like
-from warpfrag.capture.shade_adjoint import shade_backward
+from warpfrag.capture.shade import SHADE, shade_backward, shade_forward
+from warpfrag.capture.surfaces import CameraSurfaces, SurfaceArrays, check_scene, surface_arrays, surfaces_of
+from warpfrag.errors import check_choice, check_whole
 from warpfrag.fragments import Layers
-from warpfrag.raster.ray import Window
-from warpfrag.raster.triangles import (
-    Triangles,
-    count_fragments,
-    prepare_triangles,
-    scan_counts,
-    sort_fragments,
-    store_fragments,
-)
-from warpfrag.resolve.arguments import check_choice
-from warpfrag.scene.assemble import assemble
+from warpfrag.raster.ray import Window, centre_x, centre_y, stretch
+from warpfrag.raster.triangles import prepare_triangles
 from warpfrag.scene.camera import Camera
 from warpfrag.scene.scene import Scene
-from warpfrag.storage.kbuffer import (
-    KBUFFER_OPTIONS,
+from warpfrag.storage.into_slots import (
     LAYER_OUTPUTS,
     KMerge,
+    Source,
     Tail,
-    as_layers,
     check_kbuffer,
-    kbuffer_backward,
-    layers_like,
+    kbuffer_bytes,
+    kbuffer_storage,
 )
+from warpfrag.storage.kbuffer import KBufferOptions, as_layers, kbuffer_backward
+from warpfrag.storage.lists import DYNAMIC, sort_lists
+from warpfrag.storage.method import Room, count_fragments, fill
+from warpfrag.storage.occupancy import TALLY_ALL, TALLY_BEHIND, TALLY_OCCUPANCY, TALLY_ROWS
+
+wp.set_module_options({"enable_backward": False})
 
 Cull = Literal["occupancy"]
 
 # Memory that the fragments of a band take on the way back, with their gradients [bytes].
 BAND_BYTES = 1 << 28
-# Of a slot: colour and opacity, depth, z-thickness, opacity sum: numbers.
-SLOT_NUMBERS = 7
-
-_TABLES = SHADE_TENSORS[SHADE_TENSORS.index("object_id") :]
-_TENSORS = (*SHADE_DIFFERENTIABLE, "faces", *_TABLES)
 
 
-def kbuffer_bytes(pixel_count: int, slots: int, scalar: Any = wp.float32, words: int = 0) -> int:
-    """Return the memory of a k-buffer: of its layers, and of the occupancy maps while they are captured [bytes].
+@wp.struct
+class Place:
+    """Where the ray of a pixel meets a triangle: that one's corners, the `hit_weights`, and the depth along the ray."""
 
-    Args:
-        pixel_count: number of pixels.
-        slots: slots of a pixel, K.
-        scalar: Warp type of the numbers.
-        words: words of a pixel's occupancy map; 0 for none.
+    corner: wp.vec3i
+    hit: wp.vec3d
+    depth: wp.float64
+
+
+@wp.func(inline=True)
+def locate(surface: Any, pixel: int, face: int) -> Place:
+    """Return where the ray of a pixel meets a triangle."""
+    rays = surface.rays
+    row = pixel // rays.width
+    x = centre_x(rays, pixel - row * rays.width)
+    y = centre_y(rays, row)
+    place = Place()
+    place.corner = surface.corners[face]
+    place.hit = hit_of(surface, place.corner, x, y)
+    place.depth = place.hit[2] * stretch(x, y, rays.scale, rays.perspective)
+    return place
+
+
+@wp.func(inline=True)
+def front_of(surface: Any, pixel: int, face: int, place: Place, depth: Any):
+    """Return the front of the fragment of a triangle."""
+    item = surface.objects[surface.object_id[face]]
+    return depth - type(depth)(shade_thickness(surface, item, place.corner, place.hit, place.depth, pixel))
+
+
+@wp.func(inline=True)
+def color_of(surface: Any, pixel: int, face: int, place: Place, depth: Any):
+    """Return the colour and opacity of the fragment of a triangle, and its opacity sum."""
+    shaded = shade_color(surface, face, place.corner, place.hit)
+    opacity = type(depth)(shaded[3])
+    return wp.vector(type(depth)(shaded[0]), type(depth)(shaded[1]), type(depth)(shaded[2]), opacity), opacity
+
+
+TRIANGLES = Source(SurfaceArrays, locate, front_of, color_of)
+
+
+@dataclass(frozen=True)
+class BoundedWindow(Window):
+    """A window that is captured into a k-buffer.
+
+    Attributes:
+        slots: see `kbuffer`, as merge and tail.
+        map_words: words of 32 bits of a pixel's occupancy map; 0 for no culling by it.
     """
-    size = wp.types.type_size_in_bytes(scalar)
-    culling = 4 * words + 2 * size + 4 if words else 0
-    return pixel_count * (slots * SLOT_NUMBERS * size + 4 + culling)
+
+    slots: int
+    merge: str
+    tail: str
+    map_words: int
+
+    def sizes(self) -> dict[str, int]:
+        """Return the sizes of outputs that no input has."""
+        return {"P": self.pixel_count, "slots": self.slots}
 
 
-def _output_like(inputs: Sequence[Any], width: int, row_count: int, slots: int, **options: Any) -> list:
-    return layers_like(width * row_count, slots)
+def operator_arrays(surfaces: CameraSurfaces) -> dict[str, Any]:
+    """Return surfaces as the arrays of `CAPTURE_KBUFFER`."""
+    return {
+        each.name: getattr(surfaces, each.name, getattr(surfaces.tables, each.name, None))
+        for each in CAPTURE_KBUFFER.arguments
+    }
 
 
-def _split(options: Mapping[str, Any]) -> tuple[Window, dict[str, Any]]:
-    return Window(**{name: options[name] for name in SHADE_OPTIONS}), {name: options[name] for name in KBUFFER_OPTIONS}
-
-
-def _inputs(surfaces: Surfaces) -> tuple[Any, ...]:
-    """Return a scene's arrays as `_TENSORS`."""
-    differentiable = (surfaces.points, surfaces.rgba, surfaces.thickness, surfaces.maps)
-    return (*differentiable, as_kind(surfaces.faces, surfaces.points), *surfaces.tables)
-
-
-def _without_faces(inputs: Sequence[Any]) -> tuple[Any, ...]:
-    return (*inputs[:4], *inputs[5:])
-
-
-def _forward(inputs: Sequence[Any], outputs: Sequence[Any], words: int, **options: Any) -> None:
-    window, choice = _split(options)
-    triangles = prepare_triangles(inputs[0], inputs[4], window)
-    stream_triangles(
-        triangles, _without_faces(inputs), outputs, merge=choice["merge"], tail=choice["tail"], words=words
+def _stream_triangles(
+    inputs: SimpleNamespace, outputs: SimpleNamespace, options: BoundedWindow, tally_rows: wp.array | None = None
+) -> None:
+    """Rasterise and shade all triangles into the slots of their pixels, which become layers."""
+    triangles = prepare_triangles(inputs.points, inputs.faces, options)
+    storage = kbuffer_storage(
+        TRIANGLES,
+        surface_arrays({**vars(inputs), "corners": triangles.corners}, options),
+        outputs,
+        merge=options.merge,
+        tail=options.tail,
+        map_words=options.map_words,
+        tally_rows=tally_rows,
     )
+    # The layers are there already; there is nothing to reserve.
+    fill(storage, triangles, Room(options.pixel_count, triangles.points.dtype, triangles.device, lambda *told: None))
 
 
 def _backward(
-    inputs: Sequence[Any], grad_outputs: Sequence[Any], grad_inputs: Sequence[Any], words: int, **options: Any
+    inputs: SimpleNamespace, grads: SimpleNamespace, targets: SimpleNamespace, options: BoundedWindow
 ) -> None:
-    window, choice = _split(options)
-    points, faces = inputs[0], inputs[4]
-    counts = count_fragments(prepare_triangles(points, faces, window))
-    row_counts = counts.numpy().reshape(window.row_count, window.width).sum(axis=1, dtype=np.int64)
-    targets = grad_inputs[:4]
-    for target in targets:
-        if target is not None:
-            target.zero_()
+    counts = count_fragments(prepare_triangles(inputs.points, inputs.faces, options))
+    row_counts = counts.numpy().reshape(options.row_count, options.width).sum(axis=1, dtype=np.int64)
+    wanted = {name: target for name, target in vars(targets).items() if target is not None}
+    for target in wanted.values():
+        target.zero_()
     if not row_counts.any():
         return
-    fragment_size = fragment_bytes(points.dtype, gradient=True)
-    for begin, end in split_rows(
-        row_counts, 0.0, fragment_size, max(BAND_BYTES, int(row_counts.max()) * fragment_size)
-    ):
-        pixels = slice(begin * window.width, end * window.width)
-        band = replace(window, first_row=window.first_row + begin, row_count=end - begin)
-        grads = [None if grad is None else grad[pixels] for grad in grad_outputs]
-        partial = [None if target is None else wp.empty_like(target) for target in targets]
-        _backward_band(inputs, counts[pixels], prepare_triangles(points, faces, band), grads, partial, choice)
-        for target, part in zip(targets, partial, strict=True):
-            if target is not None and part is not None:
-                add(target.flatten(), part.flatten())
+    fragment_size = fragment_bytes(inputs.points.dtype, gradient=True)
+    allowed = max(BAND_BYTES, int(row_counts.max()) * fragment_size)
+    for begin, end in split_rows(row_counts, 0.0, fragment_size, allowed):
+        pixels = slice(begin * options.width, end * options.width)
+        band = replace(options, first_row=options.first_row + begin, row_count=end - begin)
+        own = {name: None if grad is None else grad[pixels] for name, grad in vars(grads).items()}
+        partial = {name: wp.empty_like(target) for name, target in wanted.items()}
+        parts = SimpleNamespace(**{name: partial.get(name) for name in vars(targets)})
+        _backward_band(inputs, counts[pixels], SimpleNamespace(**own), parts, band)
+        for name, target in wanted.items():
+            add_in_place(target.flatten(), partial[name].flatten())
 
 
 def _backward_band(
-    inputs: Sequence[Any],
-    counts: wp.array,
-    triangles: Triangles,
-    grad_layers: Sequence[Any],
-    targets: Sequence[Any],
-    choice: Mapping[str, Any],
+    inputs: SimpleNamespace, counts: wp.array, grads: SimpleNamespace, targets: SimpleNamespace, band: BoundedWindow
 ) -> None:
     """Fill the gradients of points, rgba, thickness and maps by the pixels of a window."""
-    device, scalar = triangles.device, triangles.points.dtype
-    options = asdict(triangles.window)
-    starts, total = scan_counts(counts)
-    faces, depths = store_fragments(triangles, starts, total, False)
-    sort_fragments(starts, faces, depths)
-    surfaces = (*inputs[:4], triangles.corners, faces, starts, *inputs[5:])
-    like = shade_output_like(surfaces, **options)
-    shaded = [wp.empty(shape, dtype=scalar if kind == "float" else int, device=device) for shape, kind in like]
-    shade_forward(surfaces, shaded, **options)
-    grads = [wp.empty_like(array) for array in shaded[:3]]
-    kbuffer_backward((*shaded[:3], starts, None), grad_layers, (*grads, None, None), **choice)
-    shade_backward(surfaces, (*grads, None, None), (*targets, *[None] * len(surfaces[4:])), **options)
+    number, device = inputs.points.dtype, inputs.points.device
+    triangles = prepare_triangles(inputs.points, inputs.faces, band)
+    room = Room(band.pixel_count, number, device, lambda *told: None, keep_depths=False, counts=counts)
+    lists = fill(DYNAMIC, triangles, room)
+    sort_lists(lists)
+    surfaces = SimpleNamespace(**vars(inputs), corners=triangles.corners, offsets=lists.offsets, covered=None)
+    surfaces.faces = lists.items
+    shaded = empty_outputs(SHADE, surfaces, band, requires_grad=False)
+    shade_forward(surfaces, shaded, band)
+    fragments = SimpleNamespace(
+        rgba=shaded.rgba, depth=shaded.depth, thickness=shaded.thickness, offsets=lists.offsets, opacity_sum=None
+    )
+    own = {name: wp.empty_like(getattr(shaded, name)) for name in ("rgba", "depth", "thickness")}
+    fragment_grads = SimpleNamespace(**own, opacity_sum=None)
+    kbuffer_backward(fragments, grads, fragment_grads, KBufferOptions(band.slots, band.merge, band.tail))
+    shade_backward(surfaces, fragment_grads, targets, band)
 
 
-_CAPTURE_KBUFFER = Operator(
+CAPTURE_KBUFFER = Operator(
     name="capture_kbuffer",
-    tensors=_TENSORS,
-    differentiable=SHADE_DIFFERENTIABLE,
+    inputs=SHADE.inputs,
+    tables=(
+        Input("faces", "N 3", None),
+        *(each for each in SHADE.tables if each.name not in ("corners", "faces", "offsets", "covered")),
+    ),
     outputs=LAYER_OUTPUTS,
-    output_like=_output_like,
-    forward=_forward,
+    options=BoundedWindow,
+    forward=_stream_triangles,
     backward=_backward,
-    options={**SHADE_OPTIONS, **KBUFFER_OPTIONS, "words": "int"},
 )
 
 
@@ -205,17 +242,31 @@ def capture_kbuffer(
         (512, 512, 4)
     """
     camera = check_scene(scene, camera)
-    words = _check_options(slots, merge, tail, cull, words)
-    surfaces = place_surfaces(assemble(scene, parameters, camera=camera), camera)
-    window = Window.of(camera)
-    scalar = wp.float64 if "64" in str(surfaces.points.dtype) else wp.float32
-    needed = kbuffer_bytes(window.pixel_count, slots, scalar, words)
-    allowed = allowed_memory(memory_limit, surfaces.faces.device)
+    map_words = _check_options(slots, merge, tail, cull, words)
+    surfaces = surfaces_of(scene, camera, parameters)
+    options = {"slots": int(slots), "merge": merge, "tail": tail, "map_words": map_words}
+    with surfaces.in_order():
+        return kbuffer_of_surfaces(surfaces, Window.of(camera), memory_limit, **options)
+
+
+def kbuffer_of_surfaces(
+    surfaces: CameraSurfaces,
+    window: Window,
+    memory_limit: float | None,
+    *,
+    slots: int,
+    merge: str,
+    tail: str,
+    map_words: int = 0,
+) -> Layers:
+    """Return the layers of surfaces in a window; arguments are those of `capture_kbuffer`, checked."""
+    needed = kbuffer_bytes(window.pixel_count, slots, surfaces.number, map_words)
+    allowed = allowed_memory(memory_limit, surfaces.device)
     if needed > allowed:
         refuse(needed, allowed, f"{slots} slots for each of {window.pixel_count} pixels")
-    options = {**asdict(window), "slots": int(slots), "merge": merge, "tail": tail, "words": words}
-    with surfaces.stream():
-        return as_layers(apply(_CAPTURE_KBUFFER, _inputs(surfaces), **options), camera.shape, slots)
+    options = BoundedWindow(**asdict(window), slots=slots, merge=merge, tail=tail, map_words=map_words)
+    outputs = apply(CAPTURE_KBUFFER, operator_arrays(surfaces), options)
+    return as_layers(outputs, (window.row_count, window.width), slots)
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,19 +315,19 @@ def count_culled(
         (76290, 357178)
     """
     camera = check_scene(scene, camera)
-    words = _check_options(slots, merge, tail, cull, words)
-    surfaces = place_surfaces(assemble(scene, parameters, camera=camera), camera)
-    inputs = [None if array is None else to_warp(array) for array in _inputs(surfaces)]
-    triangles = prepare_triangles(inputs[0], inputs[4], Window.of(camera))
-    device, scalar, pixel_count = triangles.device, triangles.points.dtype, triangles.window.pixel_count
-    outputs = [
-        wp.empty(shape, dtype=scalar if kind == "float" else int, device=device)
-        for shape, kind in layers_like(pixel_count, slots)
-    ]
-    tally = wp.zeros((TALLY_ROWS, pixel_count), dtype=int, device=device)
-    stream_triangles(triangles, _without_faces(inputs), outputs, merge=merge, tail=tail, words=words, tally=tally)
-    rows = tally.numpy().reshape(TALLY_ROWS, *camera.shape)
-    return Culling(*(rows[int(row)] for row in (TALLY_ALL, TALLY_OCCUPANCY, TALLY_BEHIND)))
+    map_words = _check_options(slots, merge, tail, cull, words)
+    surfaces = surfaces_of(scene, camera, parameters)
+    window = Window.of(camera)
+    options = BoundedWindow(**asdict(window), slots=int(slots), merge=merge, tail=tail, map_words=map_words)
+    kind, arrays = surfaces.kind, operator_arrays(surfaces)
+    for name in ("points", "rgba", "thickness", "maps"):
+        arrays[name] = None if arrays[name] is None else kind.to_warp(arrays[name])
+    inputs = SimpleNamespace(**arrays)
+    outputs = empty_outputs(CAPTURE_KBUFFER, inputs, options, requires_grad=False)
+    rows = wp.zeros((TALLY_ROWS, window.pixel_count), dtype=int, device=surfaces.device)
+    _stream_triangles(inputs, outputs, options, rows)
+    counts = rows.numpy().reshape(TALLY_ROWS, *camera.shape)
+    return Culling(*(counts[int(row)] for row in (TALLY_ALL, TALLY_OCCUPANCY, TALLY_BEHIND)))
 
 
 def _check_options(slots: Any, merge: Any, tail: Any, cull: Any, words: Any) -> int:
@@ -287,11 +338,8 @@ def _check_options(slots: Any, merge: Any, tail: Any, cull: Any, words: Any) -> 
     check_choice("cull", cull, get_args(Cull))
     if merge != "none" or tail != "discard":
         raise ValueError(
-            f'cull: got {cull!r} with merge={merge!r} and tail={tail!r}, expected merge="none" and tail="discard" '
+            f'cull: got "{cull}" with merge="{merge}" and tail="{tail}", expected merge="none" and tail="discard" '
             "(else fragments behind the K nearest count as well)"
         )
-    if isinstance(words, bool) or not isinstance(words, (int, np.integer)):
-        raise TypeError(f"words: got {words!r}, expected a whole number")
-    if 32 * words <= slots:
-        raise ValueError(f"words: got {words}, expected more than {slots // 32}, for {slots} slots")
-    return int(words)
+    # A map of no more buckets than slots culls nothing.
+    return check_whole("words", words, slots // 32 + 1)

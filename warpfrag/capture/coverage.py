@@ -1,5 +1,7 @@
 """Coverage: which triangles each pixel sees, in which order, held fixed while what they look like changes.
 
+`capture` is both halves at once, what is seen and what it looks like.
+
     coverage = Coverage.of(scene)
     fragments = coverage.shade({"ball.translation": torch.tensor([0.0, 0.0, 0.1])})
 
@@ -11,45 +13,52 @@ or changes its place in the order.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import warp as wp
 
+from warpfrag.arrays.apply import apply
+from warpfrag.arrays.kinds import WARP, dtype_name, kind_of
 from warpfrag.arrays.launch import Span, launch
-from warpfrag.arrays.legacy import dtype_name, kind_of, vectors
-from warpfrag.capture.capture import (
-    Surfaces,
+from warpfrag.arrays.precisions import kernels
+from warpfrag.capture.corner_gradients import ShadedGradients, fragment_adjoint, load_corners
+from warpfrag.capture.memory import Budget, CaptureSizes
+from warpfrag.capture.shade import SHADE, shaded_gradients
+from warpfrag.capture.surfaces import (
+    CameraSurfaces,
+    SurfaceArrays,
+    SurfaceTables,
     check_scene,
-    count_within,
-    faces_of_fragments,
-    place_surfaces,
-    shade_fragments,
-    to_warp,
+    surface_arrays,
+    surfaces_of,
 )
-from warpfrag.capture.fragment_adjoint import fragment_adjoint, load_triangle
-from warpfrag.capture.shade import present
+from warpfrag.errors import is_whole
 from warpfrag.fragments import Fragments
-from warpfrag.raster.ray import Rays, Window, centre_x, centre_y
-from warpfrag.scene.assemble import assemble
+from warpfrag.raster.ray import Window, centre_x, centre_y
+from warpfrag.raster.triangles import RasterTriangles
 from warpfrag.scene.camera import Camera
 from warpfrag.scene.scene import Scene
+from warpfrag.storage.lists import DYNAMIC, sort_lists
+from warpfrag.storage.method import Room, Storage, count_fragments, fill
 
 wp.set_module_options({"enable_backward": False})
 
 
 @dataclass(frozen=True, eq=False)
 class Coverage:
-    """Which triangles each pixel of an image sees, in order.
+    """Which triangles each pixel of an image, or of some of its rows, sees, in order.
 
     Attributes:
         scene: the scene.
         camera: where from.
+        window: the pixels.
         corners: vertices of each triangle, (N, 3) int32 Warp array.
         faces: triangle of each fragment, (F,) int32 Warp array.
         offsets: pixel p sees the fragments offsets[p] : offsets[p + 1], (P + 1,) int32 Warp array.
-        points: where the vertices were, in camera space [scene units], (V, 3) float64 Warp array.
+        points: where the vertices were, in camera space [scene units], (V, 3) Warp array.
+        tables: what of the scene's surfaces no parameter changes.
 
     Example:
         >>> coverage = Coverage.of(wf.load_scene("scenes/three_spheres.toml"))
@@ -59,10 +68,12 @@ class Coverage:
 
     scene: Scene
     camera: Camera
+    window: Window
     corners: wp.array
     faces: wp.array
     offsets: wp.array
     points: wp.array
+    tables: SurfaceTables
 
     @staticmethod
     def of(
@@ -88,11 +99,9 @@ class Coverage:
             MemoryError: there would be more fragments than the limit allows; nothing has been stored yet.
         """
         camera = check_scene(scene, camera)
-        surfaces = place_surfaces(assemble(scene, parameters, camera=camera), camera)
-        with surfaces.stream():
-            triangles, starts, total = count_within(surfaces, Window.of(camera), memory_limit)
-            faces = faces_of_fragments(triangles, starts, total, sort)
-            return Coverage(scene, camera, triangles.corners, faces, starts, _cast(triangles.points, wp.float64))
+        surfaces = surfaces_of(scene, camera, parameters)
+        with surfaces.in_order():
+            return find_coverage(scene, camera, surfaces, Window.of(camera), sort=sort, memory_limit=memory_limit)
 
     @property
     def count(self) -> int:
@@ -115,10 +124,31 @@ class Coverage:
             TypeError: an argument is of the wrong type.
             ValueError: an argument is out of its range.
         """
-        surfaces = self._surfaces(parameters)
-        with surfaces.stream():
-            corners, faces, offsets, points = self._on(surfaces.faces.device)
-            return shade_fragments(surfaces, Window.of(self.camera), corners, faces, offsets, points)
+        surfaces = surfaces_of(self.scene, self.camera, parameters, self.tables)
+        with surfaces.in_order():
+            return self.to(surfaces.device).shade_surfaces(surfaces)
+
+    def shade_surfaces(self, surfaces: CameraSurfaces, *, moved: bool = True) -> Fragments:
+        """Shade the fragments by surfaces on the same device; `moved` unless coverage was found with these."""
+        inputs = {name: getattr(surfaces, name) for name in ("points", "rgba", "thickness", "maps", "objects")}
+        tables = {name: getattr(self.tables, name) for name in ("object_id", "uv", "texture_id", "texels", "textures")}
+        found = {"corners": self.corners, "faces": self.faces, "offsets": self.offsets}
+        covered = self.points if moved else None
+        shaded = apply(SHADE, {**inputs, **tables, **found, "covered": covered}, self.window)
+        offsets = surfaces.kind.from_warp(self.offsets)
+        return Fragments(**vars(shaded), offsets=offsets, shape=(self.window.row_count, self.window.width))
+
+    def is_of(self, surfaces: CameraSurfaces) -> bool:
+        """Tell whether surfaces of this scene and camera have the vertices that coverage was found with, to the bit."""
+        points = surfaces.kind.to_warp(surfaces.points)
+        return points.dtype == self.points.dtype and np.array_equal(points.numpy(), self.points.numpy())
+
+    def to(self, device: wp.Device) -> "Coverage":
+        """Return the same coverage on a device, itself if it is there."""
+        if self.faces.device == device:
+            return self
+        arrays = [array.to(device) for array in (self.corners, self.faces, self.offsets, self.points)]
+        return Coverage(self.scene, self.camera, self.window, *arrays, self.tables.to(device))
 
     def motion_gradients(
         self, parameters: Mapping[str, Any] | None, grad_rgba: Any, grad_depth: Any, grad_thickness: Any
@@ -143,103 +173,181 @@ class Coverage:
             TypeError: an argument is of the wrong type.
             ValueError: an argument has the wrong shape or is out of its range.
         """
-        surfaces = self._surfaces(parameters)
-        device = surfaces.faces.device
-        with surfaces.stream():
-            corners, faces, offsets, _ = self._on(device)
-            points = to_warp(surfaces.points)
-            scalar = points.dtype
-            others = (surfaces.rgba, surfaces.thickness, surfaces.maps, *surfaces.tables)
-            arrays = [points, *(None if array is None else to_warp(array) for array in others)]
-            grads = [
-                _cotangent(name, grad, shape, scalar, device)
-                for name, grad, shape in (
-                    ("grad_rgba", grad_rgba, (self.count, 4)),
-                    ("grad_depth", grad_depth, (self.count,)),
-                    ("grad_thickness", grad_thickness, (self.count,)),
-                )
-            ]
-            grads[0] = vectors(grads[0])
-            motions = wp.empty((self.count, 2), dtype=wp.vec3d, device=device)
+        surfaces = surfaces_of(self.scene, self.camera, parameters, self.tables)
+        with surfaces.in_order():
+            here, number = self.to(surfaces.device), surfaces.number
+            grads = SimpleNamespace(
+                rgba=_cotangent("grad_rgba", grad_rgba, (self.count, 4), surfaces),
+                depth=_cotangent("grad_depth", grad_depth, (self.count,), surfaces),
+                thickness=_cotangent("grad_thickness", grad_thickness, (self.count,), surfaces),
+            )
+            motions = wp.empty((self.count, 2), dtype=wp.vec3d, device=surfaces.device)
             if self.count:
-                window = Window.of(self.camera)
-                tensors = present((*arrays[:4], corners, faces, offsets, *arrays[4:]))
-                arguments = [window.rays(), *tensors, *grads, motions]
-                launch(_motion_kernel(scalar), window.pixel_count, arguments, device)
+                arrays = {name: getattr(surfaces, name) for name in ("points", "rgba", "thickness", "maps")}
+                shared = {name: None if a is None else surfaces.kind.to_warp(a) for name, a in arrays.items()}
+                own = {"corners": here.corners, "objects": surfaces.objects, **shared}
+                surface = surface_arrays({**vars(here.tables), **own}, self.window)
+                inputs = [surface, here.faces, here.offsets, shaded_gradients(number, grads), motions]
+                launch(motion_bwd(number), self.window.pixel_count, inputs, surfaces.device)
             return motions.numpy().reshape(self.count, 6)
 
-    def _surfaces(self, parameters: Mapping[str, Any] | None) -> Surfaces:
-        return place_surfaces(assemble(self.scene, parameters, camera=self.camera), self.camera)
 
-    def _on(self, device: wp.Device) -> list[wp.array]:
-        return [array.to(device) for array in (self.corners, self.faces, self.offsets, self.points)]
+def find_coverage(
+    scene: Scene,
+    camera: Camera,
+    surfaces: CameraSurfaces,
+    window: Window,
+    *,
+    sort: bool,
+    memory_limit: float | None,
+) -> Coverage:
+    """Find out which of the surfaces the pixels of a window see; arguments are those of `Coverage.of`."""
+    triangles = surfaces.triangles(window)
+    budget = Budget.of(CaptureSizes.of(triangles), memory_limit, surfaces)
+    return store_coverage(scene, camera, surfaces, triangles, count_fragments(triangles), budget, sort=sort)
 
 
-@cache
-def _motion_kernel(scalar: Any) -> wp.Kernel:
-    @wp.kernel(module="unique", enable_backward=False)
-    def motion_bwd(
+def store_coverage(
+    scene: Scene,
+    camera: Camera,
+    surfaces: CameraSurfaces,
+    triangles: RasterTriangles,
+    counts: wp.array,
+    budget: Budget,
+    *,
+    sort: bool,
+    storage: Storage = DYNAMIC,
+) -> Coverage:
+    """Store which triangles the pixels of a window see.
+
+    Args:
+        scene: the scene.
+        camera: where from.
+        surfaces: its surfaces.
+        triangles: these as rasterising takes them.
+        counts: number of fragments of each pixel, (P,) int32.
+        budget: what may be taken.
+        sort: order of a pixel's fragments: by depth, or as submitted.
+        storage: how to store them.
+
+    Raises:
+        MemoryError: there would be more fragments than the budget allows.
+    """
+    room = Room(counts.shape[0], triangles.points.dtype, triangles.device, budget.reserve, sort, counts)
+    lists = fill(storage, triangles, room)
+    sort_lists(lists)
+    found = (triangles.corners, lists.items, lists.offsets, triangles.points)
+    return Coverage(scene, camera, triangles.window, *found, surfaces.tables)
+
+
+def capture(
+    scene: Scene,
+    camera: Camera | None = None,
+    sort: bool = True,
+    *,
+    parameters: Mapping[str, Any] | None = None,
+    rows: tuple[int, int] | None = None,
+    memory_limit: float | None = None,
+) -> Fragments:
+    """Capture every surface that a pixel's ray meets as a fragment (the dynamic fragment buffer).
+
+    A triangle covers a pixel if the pixel's centre lies in its projection: by the top-left rule on edges, from both
+    sides, between the near and far planes. Differentiable in vertices, translations and rotations of objects and
+    camera, colour, opacity and thickness; which pixels a triangle covers, the order of the fragments, the texels that a
+    lookup takes and the baked Lambert factors are held fixed: a gradient in vertices or poses moves depths and
+    attributes inside outlines, not the outlines.
+
+    Args:
+        scene: what to capture.
+        camera: where from; default the scene's.
+        sort: order of a pixel's fragments: by (depth, object, primitive), or as submitted, by (object, primitive).
+        parameters: values in place of the scene's own, by the names of `scene.parameters()`: numbers, NumPy arrays, or
+            torch tensors, in which the fragments are then differentiable. `"thickness"` is that of all objects without
+            a value of their own here. `"beta"` is not used here.
+        rows: capture only these rows [begin, end) of the image; default all.
+        memory_limit: most memory that fragments and their gradients may take [bytes]; default half of what is free.
+
+    Returns:
+        Fragments of shape (H, W), or (end - begin, W), with object and primitive ids; torch tensors if any parameter is
+        one, else NumPy arrays; float64 if any parameter is an array of that, else float32.
+
+    Raises:
+        TypeError: an argument is of the wrong type.
+        ValueError: an argument is out of its range.
+        MemoryError: there would be more fragments than the limit allows; nothing has been stored yet.
+
+    Example:
+        >>> wf.capture(wf.load_scene("scenes/three_spheres.toml")).shape
+        (512, 512)
+    """
+    camera = check_scene(scene, camera)
+    window = Window.of(camera, _check_rows(rows, camera))
+    surfaces = surfaces_of(scene, camera, parameters)
+    with surfaces.in_order():
+        coverage = find_coverage(scene, camera, surfaces, window, sort=sort, memory_limit=memory_limit)
+        return coverage.shade_surfaces(surfaces, moved=False)
+
+
+def _check_rows(rows: Any, camera: Camera) -> tuple[int, int]:
+    height = camera.shape[0]
+    if rows is None:
+        return 0, height
+    begin, end = rows
+    if not all(map(is_whole, (begin, end))) or not 0 <= begin <= end <= height:
+        raise ValueError(f"rows: got {rows!r}, expected whole numbers (begin, end) with 0 <= begin <= end <= {height}")
+    return int(begin), int(end)
+
+
+@kernels
+def motion_bwd(number: Any) -> Any:
+    """Return the kernel of the gradients in rigid motions."""
+
+    def kernel(
         span: Span,
-        rays: Rays,
-        points: wp.array(dtype=wp.types.vector(3, scalar)),
-        rgba: wp.array(dtype=wp.types.vector(4, scalar)),
-        thickness: wp.array(dtype=scalar),
-        maps: wp.array2d(dtype=scalar),
-        corners: wp.array(dtype=wp.vec3i),
-        fragment_face: wp.array(dtype=int),
+        surface: SurfaceArrays[number],
+        faces: wp.array(dtype=int),
         offsets: wp.array(dtype=int),
-        object_id: wp.array(dtype=int),
-        objects: wp.array(dtype=wp.vec3i),
-        uv: wp.array(dtype=wp.vec2f),
-        texture_id: wp.array(dtype=int),
-        texels: wp.array(dtype=wp.vec4f),
-        textures: wp.array(dtype=wp.vec3i),
-        grad_fragment_rgba: wp.array(dtype=wp.types.vector(4, scalar)),
-        grad_fragment_depth: wp.array(dtype=scalar),
-        grad_fragment_thickness: wp.array(dtype=scalar),
+        grads: ShadedGradients[number],
         motions: wp.array2d(dtype=wp.vec3d),
     ):
+        """Turn the gradients of fragments into forces and torques.
+
+        Args:
+            span: the pixels.
+            surface: what was shaded.
+            faces: triangle of each fragment, (F,).
+            offsets: see `Fragments`, (P + 1,).
+            grads: gradients of the fragments.
+            motions: output, force [1 / scene unit] and torque [1 / radian] of each fragment, (F, 2).
+        """
+        rays = surface.rays
         for pixel in range(span.begin + wp.tid(), span.end, span.stride):
             row = pixel // rays.width
             x = centre_x(rays, pixel - row * rays.width)
             y = centre_y(rays, row)
             for fragment in range(offsets[pixel], offsets[pixel + 1]):
-                face = fragment_face[fragment]
-                own = load_triangle(points, rgba, thickness, corners, object_id, objects, uv, texture_id, face)
-                to = fragment_adjoint(
-                    rays, own, maps, texels, textures,
-                    grad_fragment_rgba, grad_fragment_depth, grad_fragment_thickness,
-                    fragment, pixel, x, y, True,
-                )  # fmt: skip
-                force = to.point_a + to.point_b + to.point_c
+                triangle = load_corners(surface, faces[fragment])
+                gradients = fragment_adjoint(surface, triangle, grads, fragment, pixel, x, y, True)
+                force = gradients.point_a + gradients.point_b + gradients.point_c
                 torque = (
-                    wp.cross(own.point_a, to.point_a)
-                    + wp.cross(own.point_b, to.point_b)
-                    + wp.cross(own.point_c, to.point_c)
+                    wp.cross(triangle.point_a, gradients.point_a)
+                    + wp.cross(triangle.point_b, gradients.point_b)
+                    + wp.cross(triangle.point_c, gradients.point_c)
                 )
                 motions[fragment, 0] = force
                 motions[fragment, 1] = torque
 
-    return motion_bwd
+    return kernel
 
 
-def _cotangent(name: str, grad: Any, shape: tuple[int, ...], scalar: Any, device: wp.Device) -> wp.array:
-    """Return a gradient as a Warp array of a precision on a device, empty for None."""
+def _cotangent(name: str, grad: Any, shape: tuple[int, ...], surfaces: CameraSurfaces) -> wp.array | None:
+    """Return a gradient as a Warp array in the precision and on the device of surfaces; None stays."""
     if grad is None:
-        return wp.empty((0, *shape[1:]), dtype=scalar, device=device)
-    if kind_of(grad) is None or dtype_name(grad) not in ("float32", "float64"):
-        found = type(grad).__name__ if kind_of(grad) is None else dtype_name(grad)
-        raise TypeError(f"{name}: got {found}, expected a NumPy array, wp.array or torch.Tensor of floats")
+        return None
+    kind = kind_of(grad)
+    if kind is None or dtype_name(grad) not in ("float32", "float64"):
+        got = type(grad).__name__ if kind is None else dtype_name(grad)
+        raise TypeError(f"{name}: got {got}, expected a NumPy array, wp.array or torch.Tensor of floats")
     if tuple(grad.shape) != shape:
         raise ValueError(f"{name}: got shape {tuple(grad.shape)}, expected {shape}")
-    array = grad.contiguous() if kind_of(grad) == "warp" else to_warp(grad)
-    return _cast(array, scalar).to(device)
-
-
-def _cast(array: wp.array, scalar: Any) -> wp.array:
-    """Return an array in a precision."""
-    if array.dtype == scalar:
-        return array
-    cast = wp.empty(array.shape, dtype=scalar, device=array.device)
-    wp.utils.array_cast(array, cast)
-    return cast
+    return WARP.astype(kind.to_warp(grad), dtype_name(surfaces.points)).to(surfaces.device)

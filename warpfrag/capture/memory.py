@@ -1,12 +1,15 @@
 """How much memory a capture takes, and how much it may take: predicted after the count, before anything is stored."""
 
 import os
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import warp as wp
 
-from warpfrag.raster.triangles import Triangles
+from warpfrag.capture.surfaces import CameraSurfaces
+from warpfrag.errors import check_number
+from warpfrag.raster.triangles import RasterTriangles
 
 # Triangle, object and primitive of a fragment [bytes]; then colour and opacity, depth, z-thickness: numbers.
 FRAGMENT_INDICES = 12
@@ -57,11 +60,7 @@ def allowed_memory(memory_limit: float | None, device: wp.Device) -> float:
     if memory_limit is None:
         free = free_memory(device)
         return float("inf") if free is None else 0.5 * free
-    if isinstance(memory_limit, bool) or not isinstance(memory_limit, (int, float, np.number)):
-        raise TypeError(f"memory_limit: got {type(memory_limit).__name__}, expected a number of bytes")
-    if not memory_limit > 0:
-        raise ValueError(f"memory_limit: got {memory_limit}, expected a number of bytes above 0")
-    return float(memory_limit)
+    return check_number("memory_limit", memory_limit, above=0.0)
 
 
 def fragment_bytes(scalar: type, gradient: bool) -> int:
@@ -70,14 +69,30 @@ def fragment_bytes(scalar: type, gradient: bool) -> int:
     return FRAGMENT_INDICES + FRAGMENT_NUMBERS * size * (2 if gradient else 1)
 
 
-def fixed_bytes(triangles: Triangles, gradient: bool) -> int:
-    """Return the bytes that a capture takes whatever the number of fragments."""
-    corner_count = triangles.corners.size
-    seen = corner_count // 3 if triangles.listed is None else triangles.listed.shape[0]
-    bytes = 16 * (corner_count // 3) + 4 * corner_count + 4 * seen
-    if gradient:
-        bytes += STRIP_BYTES * min(seen, corner_count // 3) + CORNER_SORT_BYTES * (corner_count // 3)
-    return bytes
+@dataclass(frozen=True)
+class CaptureSizes:
+    """How much there is to capture.
+
+    Attributes:
+        triangle_count: number of triangles.
+        listed: entries of the lists of triangles by band of rows; those of all triangles where there are none.
+    """
+
+    triangle_count: int
+    listed: int
+
+    @staticmethod
+    def of(triangles: RasterTriangles) -> "CaptureSizes":
+        """Return the sizes of triangles."""
+        count = triangles.count
+        return CaptureSizes(count, count if triangles.listed is None else triangles.listed.shape[0])
+
+    def fixed_bytes(self, gradient: bool) -> int:
+        """Return the bytes that a capture takes whatever the number of fragments."""
+        fixed = 28 * self.triangle_count + 4 * self.listed
+        if gradient:
+            fixed += STRIP_BYTES * min(self.listed, self.triangle_count) + CORNER_SORT_BYTES * self.triangle_count
+        return fixed
 
 
 def split_rows(row_counts: np.ndarray, row_bytes: float, fragment_size: int, allowed: float) -> list[tuple[int, int]]:
@@ -120,3 +135,35 @@ def _readable(bytes: float) -> str:
             return f"{bytes:.4g} {unit}"
         bytes /= 1024
     return f"{bytes:.4g} GiB"
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What a capture may take, and takes already.
+
+    Attributes:
+        fixed: memory whatever the number of fragments [bytes].
+        fragment: memory of a fragment, with its gradient if that is wanted [bytes].
+        allowed: the limit [bytes].
+    """
+
+    fixed: int
+    fragment: int
+    allowed: float
+
+    @staticmethod
+    def of(sizes: CaptureSizes, memory_limit: float | None, surfaces: CameraSurfaces) -> "Budget":
+        """Return the budget of a capture of surfaces under a limit."""
+        gradient = surfaces.differentiable
+        size = fragment_bytes(surfaces.number, gradient)
+        return Budget(sizes.fixed_bytes(gradient), size, allowed_memory(memory_limit, surfaces.device))
+
+    def allows(self, fragment_count: int) -> bool:
+        """Tell whether there is memory for so many fragments."""
+        return self.fixed + fragment_count * self.fragment <= self.allowed
+
+    def reserve(self, storage: int, what: str, fragment_count: int) -> None:
+        """Raise if a storage of so many bytes, or the fragments that are to come of it, need too much memory."""
+        needed = self.fixed + max(storage, fragment_count * self.fragment)
+        if needed > self.allowed:
+            refuse(needed, self.allowed, what)

@@ -1,214 +1,302 @@
-"""Shading: the colour, opacity, depth and z-thickness of fragments, interpolated from the corners of their triangles.
+"""Shading: the colour, opacity, depth and z-thickness of fragments, and the gradients of these by vertex and map.
 
-    E = edge functions of the pixel's ray;  l_i = E_i / sum E          (perspective-correct barycentric coordinates)
-    z = sum l_i z_i;                        depth = z |ray direction|
-    A = (sum l_i A_i) m_A;                  C = A (sum l_i c_i) m_c    (m: texel at sum l_i uv_i, bilinear; 1 without)
-    t = sum l_i t_i, or the map's pixel;    times P(depth) where t is given in multiples of that
-
+One fragment's formulas are in `warpfrag.capture.interpolation`, their gradient in `warpfrag.capture.corner_gradients`.
 Differentiable in the corners' positions, colour, opacity and thickness and in the thickness maps. Held fixed: which
 pixels a triangle covers, the order of the fragments, and which four texels a lookup takes (its place between them is
 not). Everything is computed in float64 and stored in the precision of the inputs.
+
+On the way back triangles are walked through once more, in strips of rows. A strip finds its fragments in the lists of
+the pixels that it covers and sums up their gradients, row by row, per corner; then every vertex sums up the corners of
+its triangles. No two threads write one address, and no sum depends on the number of threads. Where coverage was found
+with the vertices elsewhere, `covered`, strips look for fragments there.
 """
 
-from collections.abc import Sequence
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
 
+from warpfrag.arrays.kinds import as_vectors
 from warpfrag.arrays.launch import Span, launch
-from warpfrag.arrays.legacy import vectors
-from warpfrag.capture.texture import load_rgba, load_uv, look_up, mix3, texel_between
-from warpfrag.raster.ray import (
-    ONE,
-    ZERO,
-    Rays,
-    Window,
-    centre_x,
-    centre_y,
-    edge_functions,
-    load_point,
-    planar_depth,
-    seen_from,
-    stretch,
+from warpfrag.arrays.operator import Input, Operator, Output
+from warpfrag.arrays.precisions import Array, Number, Vector4, in_precisions, kernels
+from warpfrag.capture.corner_gradients import (
+    CornerGradients,
+    CornerValues,
+    ShadedGradients,
+    fragment_adjoint,
+    load_corners,
 )
-from warpfrag.scene.depth_resolution import DEPTH_STEP, depth_resolution
+from warpfrag.capture.corner_sums import CornerSums, add_corners, gather_corners, store_corners
+from warpfrag.capture.interpolation import hit_of, shade_color, shade_thickness, thickness_scale
+from warpfrag.capture.surfaces import OBJECT_FIRST_FACE, OBJECT_IN_P, OBJECT_MAP, SurfaceArrays, surface_arrays
+from warpfrag.raster.cover import triangle_walk
+from warpfrag.raster.ray import Window, centre_x, centre_y, stretch
+from warpfrag.raster.strips import area_of_strip, cut_strips, first_strip
+from warpfrag.raster.triangles import TriangleArrays, prepare_triangles
 
 wp.set_module_options({"enable_backward": False})
 
-# Columns of the table of objects.
-OBJECT_FIRST_FACE = wp.constant(0)
-OBJECT_MAP = wp.constant(1)
-OBJECT_IN_P = wp.constant(2)
 
-SHADE_TENSORS = (
-    *("points", "rgba", "thickness", "maps", "corners", "fragment_face", "offsets", "object_id", "objects"),
-    *("uv", "texture_id", "texels", "textures"),
-)
-_VECTORS = ("points", "rgba", "corners", "objects", "uv", "texels", "textures")
-SHADE_DIFFERENTIABLE = ("points", "rgba", "thickness", "maps")
-SHADE_OUTPUTS = ("rgba", "depth", "thickness", "object_id", "primitive_id")
-SHADE_OPTIONS = {
-    **{"scale": "float", "perspective": "int", "near": "float", "far": "float"},
-    **{"width": "int", "height": "int", "first_row": "int", "row_count": "int"},
-}
+@in_precisions
+class ShadedArrays:
+    """Shaded fragments, (F,): premultiplied colour and opacity, depth, z-thickness, object, triangle of that."""
+
+    rgba: Array[Vector4]
+    depth: Array[Number]
+    thickness: Array[Number]
+    object_id: Array[wp.int32]
+    primitive_id: Array[wp.int32]
 
 
-@wp.func
-def hit_weights(
-    a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, x: wp.float64, y: wp.float64, scale: wp.float64, perspective: int
-) -> wp.vec3d:
-    """Return the barycentric coordinates of b and c, and the planar depth, where the ray meets the triangle."""
-    e = edge_functions(
-        seen_from(a, x, y, scale, perspective),
-        seen_from(b, x, y, scale, perspective),
-        seen_from(c, x, y, scale, perspective),
-    )
-    scale = ONE / (e[0] + e[1] + e[2])
-    return wp.vec3d(e[1] * scale, e[2] * scale, planar_depth(e, a[2], b[2], c[2]))
+@kernels
+def shade_fwd(number: Any) -> Any:
+    """Return the kernel that shades fragments."""
+    vec4 = wp.types.vector(4, number)
 
-
-@wp.func
-def premultiplied(l_b: wp.float64, l_c: wp.float64, a: wp.vec4d, b: wp.vec4d, c: wp.vec4d, texel: wp.vec4d) -> wp.vec4d:
-    """Interpolate straight colour and opacity, multiply them with the texel, and the colour with the opacity."""
-    s = wp.cw_mul(mix3(a, b, c, l_b, l_c), texel)
-    return wp.vec4d(s[0] * s[3], s[1] * s[3], s[2] * s[3], s[3])
-
-
-@wp.func
-def thickness_scale(depth: wp.float64, in_p: int, near: wp.float64, far: wp.float64) -> wp.float64:
-    """Return the unit of a thickness: 1, or P(depth)."""
-    if in_p != 0:
-        return depth_resolution(depth, near, far, DEPTH_STEP)
-    return ONE
-
-
-@wp.func(inline=True)
-def shade_color(
-    rgba: Any,
-    uv: wp.array[wp.vec2f],
-    texture_id: wp.array[int],
-    texels: wp.array[wp.vec4f],
-    textures: wp.array[wp.vec3i],
-    face: int,
-    corner: wp.vec3i,
-    hit: wp.vec3d,
-) -> wp.vec4d:
-    """Return a fragment's premultiplied colour and opacity, given its triangle, that one's corners, `hit_weights`."""
-    i = corner[0]
-    j = corner[1]
-    k = corner[2]
-    texel = wp.vec4d(ONE, ONE, ONE, ONE)
-    if texture_id.shape[0] > 0:
-        texture = texture_id[face]
-        if texture >= 0:
-            place = mix3(load_uv(uv, i), load_uv(uv, j), load_uv(uv, k), hit[0], hit[1])
-            texel = texel_between(place, look_up(texels, textures, texture, place))
-    s = premultiplied(hit[0], hit[1], load_rgba(rgba, i), load_rgba(rgba, j), load_rgba(rgba, k), texel)
-    # Rounding may leave an interpolated value just outside its range.
-    return wp.vec4d(s[0], s[1], s[2], wp.clamp(s[3], ZERO, ONE))
-
-
-@wp.func(inline=True)
-def shade_thickness(
-    rays: Rays,
-    thickness: Any,
-    maps: Any,
-    object: wp.vec3i,
-    corner: wp.vec3i,
-    hit: wp.vec3d,
-    depth: wp.float64,
-    pixel: int,
-) -> wp.float64:
-    """Return a fragment's z-thickness, given its row in the table of objects, its triangle's corners and its depth."""
-    own = mix3(
-        wp.float64(thickness[corner[0]]), wp.float64(thickness[corner[1]]), wp.float64(thickness[corner[2]]),
-        hit[0], hit[1],
-    )  # fmt: skip
-    if object[OBJECT_MAP] >= 0:
-        own = wp.float64(maps[object[OBJECT_MAP], rays.first_row * rays.width + pixel])
-    own *= thickness_scale(depth, object[OBJECT_IN_P], rays.near, rays.far)
-    return wp.max(own, ZERO)
-
-
-@cache
-def _forward_kernel(scalar: Any) -> wp.Kernel:
-    vec3, vec4 = wp.types.vector(3, scalar), wp.types.vector(4, scalar)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def shade_fwd(
+    def kernel(
         span: Span,
-        rays: Rays,
-        points: wp.array(dtype=vec3),
-        rgba: wp.array(dtype=vec4),
-        thickness: wp.array(dtype=scalar),
-        maps: wp.array2d(dtype=scalar),
-        corners: wp.array(dtype=wp.vec3i),
-        fragment_face: wp.array(dtype=int),
+        surface: SurfaceArrays[number],
+        faces: wp.array(dtype=int),
         offsets: wp.array(dtype=int),
-        object_id: wp.array(dtype=int),
-        objects: wp.array(dtype=wp.vec3i),
-        uv: wp.array(dtype=wp.vec2f),
-        texture_id: wp.array(dtype=int),
-        texels: wp.array(dtype=wp.vec4f),
-        textures: wp.array(dtype=wp.vec3i),
-        fragment_rgba: wp.array(dtype=vec4),
-        fragment_depth: wp.array(dtype=scalar),
-        fragment_thickness: wp.array(dtype=scalar),
-        fragment_object: wp.array(dtype=int),
-        fragment_primitive: wp.array(dtype=int),
+        shaded: ShadedArrays[number],
     ):
+        """Shade all fragments.
+
+        Args:
+            span: the pixels.
+            surface: what to interpolate.
+            faces: triangle of each fragment, (F,).
+            offsets: see `Fragments`, (P + 1,).
+            shaded: output, the fragments.
+        """
+        rays = surface.rays
         for pixel in range(span.begin + wp.tid(), span.end, span.stride):
             row = pixel // rays.width
-            column = pixel - row * rays.width
-            x = centre_x(rays, column)
+            x = centre_x(rays, pixel - row * rays.width)
             y = centre_y(rays, row)
             along = stretch(x, y, rays.scale, rays.perspective)
             for fragment in range(offsets[pixel], offsets[pixel + 1]):
-                face = fragment_face[fragment]
-                corner = corners[face]
-                hit = hit_weights(
-                    load_point(points, corner[0]), load_point(points, corner[1]), load_point(points, corner[2]),
-                    x, y, rays.scale, rays.perspective,
-                )  # fmt: skip
+                face = faces[fragment]
+                corner = surface.corners[face]
+                hit = hit_of(surface, corner, x, y)
                 depth = hit[2] * along
-                item = object_id[face]
-                object = objects[item]
-                shaded = shade_color(rgba, uv, texture_id, texels, textures, face, corner, hit)
-                own = shade_thickness(rays, thickness, maps, object, corner, hit, depth, pixel)
-                fragment_rgba[fragment] = vec4(shaded)
-                fragment_depth[fragment] = scalar(depth)
-                fragment_thickness[fragment] = scalar(own)
-                fragment_object[fragment] = item
-                fragment_primitive[fragment] = face - object[OBJECT_FIRST_FACE]
+                owner = surface.object_id[face]
+                item = surface.objects[owner]
+                shaded.rgba[fragment] = vec4(shade_color(surface, face, corner, hit))
+                shaded.depth[fragment] = number(depth)
+                shaded.thickness[fragment] = number(shade_thickness(surface, item, corner, hit, depth, pixel))
+                shaded.object_id[fragment] = owner
+                shaded.primitive_id[fragment] = face - item[OBJECT_FIRST_FACE]
 
-    return shade_fwd
+    return kernel
 
 
-def shade_output_like(inputs: Sequence[Any], **options: Any) -> list[tuple[tuple[int, ...], str]]:
-    """Return the shapes and kinds of `SHADE_OUTPUTS`."""
-    count = inputs[5].shape[0]
-    return [((count, 4), "float"), ((count,), "float"), ((count,), "float"), ((count,), "int32"), ((count,), "int32")]
+@wp.func
+def find_fragment(faces: wp.array[int], begin: int, end: int, face: int) -> int:
+    """Return the fragment of a triangle in a pixel's list, or -1."""
+    for fragment in range(begin, end):
+        if faces[fragment] == face:
+            return fragment
+    return -1
 
 
-def present(inputs: Sequence[Any]) -> list[wp.array]:
-    """Return the inputs `SHADE_TENSORS` as kernels take them, with empty arrays in place of None: those are skipped."""
-    points = inputs[0]
-    kinds = {"maps": ((0, 0), points.dtype), "uv": ((0, 2), wp.float32), "texture_id": ((0,), wp.int32)}
-    kinds |= {"texels": ((0, 4), wp.float32), "textures": ((0, 3), wp.int32)}
-    arrays = []
-    for name, array in zip(SHADE_TENSORS, inputs, strict=True):
-        if array is None:
-            shape, dtype = kinds[name]
-            array = wp.empty(shape, dtype=dtype, device=points.device)
-        arrays.append(vectors(array) if name in _VECTORS else array)
-    return arrays
+@in_precisions
+class Strip:
+    """A strip of a triangle, what its fragments have given to the corners so far, and where those are looked up."""
+
+    surface: SurfaceArrays
+    faces: Array[wp.int32]
+    offsets: Array[wp.int32]
+    grads: ShadedGradients
+    wants_points: wp.int32
+    triangle: CornerValues
+    gradients: CornerGradients
 
 
-def shade_forward(inputs: Sequence[Any], outputs: Sequence[Any], **options: Any) -> None:
-    """Shade the fragments: `inputs` are `SHADE_TENSORS`, `outputs` `SHADE_OUTPUTS`, `options` those of a `Window`."""
-    points = inputs[0]
-    if outputs[0].shape[0]:
-        window = Window(**options)
-        arguments = [window.rays(), *present(inputs), vectors(outputs[0]), *outputs[1:]]
-        launch(_forward_kernel(points.dtype), window.pixel_count, arguments, points.device)
+@cache
+def add_fragment(number: Any, covered_number: Any) -> wp.Function:
+    """Return the visit that adds a pixel's fragment to its strip."""
+
+    @wp.func(inline=True)
+    def visit(strip: wp.ref[Strip[number]], worker: int, pixel: int, face: int, depth: covered_number):
+        fragment = find_fragment(strip.faces, strip.offsets[pixel], strip.offsets[pixel + 1], face)
+        if fragment >= 0:
+            rays = strip.surface.rays
+            row = pixel // rays.width
+            x = centre_x(rays, pixel - row * rays.width)
+            more = fragment_adjoint(
+                strip.surface, strip.triangle, strip.grads, fragment, pixel, x, centre_y(rays, row),
+                strip.wants_points != 0,
+            )  # fmt: skip
+            strip.gradients = add_corners(strip.gradients, more)
+
+    return visit
+
+
+@kernels
+def shade_bwd(number: Any, covered_number: Any) -> Any:
+    """Return the kernel of the way back to corners; the precision of the points that were covered may be another."""
+    walk = triangle_walk(covered_number, Strip[number], add_fragment(number, covered_number))
+
+    def kernel(
+        span: Span,
+        triangles: TriangleArrays[covered_number],
+        given: Strip[number],
+        strip_ends: wp.array(dtype=int),
+        strip_faces: wp.array(dtype=int),
+        sums: CornerSums,
+    ):
+        """Sum up the gradients of the corners by strip.
+
+        Args:
+            span: the strips.
+            triangles: where coverage was found.
+            given: the surfaces, the fragments, and the gradients of these.
+            strip_ends: where each triangle's strips end, (N,).
+            strip_faces: triangle of each strip, (S,).
+            sums: output, by strip and corner.
+        """
+        strip = given
+        for index in range(span.begin + wp.tid(), span.end, span.stride):
+            face = strip_faces[index]
+            strip.triangle = load_corners(strip.surface, face)
+            strip.gradients = CornerGradients()
+            number_of_face = index - first_strip(strip_ends, face)
+            area = area_of_strip(triangles.boxes[face], number_of_face, triangles.rays.width)
+            walk(strip, span.worker, triangles, face, area)
+            store_corners(sums, index, strip.gradients)
+
+    return kernel
+
+
+@kernels
+def maps_bwd(number: Any) -> Any:
+    """Return the kernel of the way back to thickness maps."""
+
+    def kernel(
+        span: Span,
+        surface: SurfaceArrays[number],
+        faces: wp.array(dtype=int),
+        offsets: wp.array(dtype=int),
+        grads: ShadedGradients[number],
+        grad_maps: wp.array2d(dtype=number),
+    ):
+        """Sum up the gradients of the thickness maps.
+
+        Args:
+            span: the pixels.
+            surface: what was shaded.
+            faces: triangle of each fragment, (F,).
+            offsets: see `Fragments`, (P + 1,).
+            grads: gradients of the fragments.
+            grad_maps: output, by map and pixel of the whole image, (maps, H·W).
+        """
+        rays = surface.rays
+        for pixel in range(span.begin + wp.tid(), span.end, span.stride):
+            row = pixel // rays.width
+            x = centre_x(rays, pixel - row * rays.width)
+            y = centre_y(rays, row)
+            for map_row in range(grad_maps.shape[0]):
+                total = wp.float64(0.0)
+                for fragment in range(offsets[pixel], offsets[pixel + 1]):
+                    face = faces[fragment]
+                    item = surface.objects[surface.object_id[face]]
+                    if item[OBJECT_MAP] == map_row:
+                        hit = hit_of(surface, surface.corners[face], x, y)
+                        depth = hit[2] * stretch(x, y, rays.scale, rays.perspective)
+                        scale = thickness_scale(depth, item[OBJECT_IN_P], rays)
+                        total += scale * wp.float64(grads.thickness[fragment])
+                grad_maps[map_row, rays.first_row * rays.width + pixel] = number(total)
+
+    return kernel
+
+
+def shade_forward(inputs: SimpleNamespace, outputs: SimpleNamespace, window: Window) -> None:
+    """Shade fragments: arguments are those of `SHADE`."""
+    number = inputs.points.dtype
+    if inputs.faces.shape[0]:
+        shaded = ShadedArrays[number]()
+        for name, array in vars(outputs).items():
+            setattr(shaded, name, as_vectors(array) if name == "rgba" else array)
+        arguments = [surface_arrays(vars(inputs), window), inputs.faces, inputs.offsets, shaded]
+        launch(shade_fwd(number), window.pixel_count, arguments, inputs.points.device)
+
+
+def shaded_gradients(number: Any, grads: SimpleNamespace) -> Any:
+    """Return the gradients of fragments, `rgba`, `depth` and `thickness` or None, as kernels take them."""
+    found = ShadedGradients[number]()
+    if grads.rgba is not None:
+        found.rgba = as_vectors(grads.rgba)
+    if grads.depth is not None:
+        found.depth = grads.depth
+    if grads.thickness is not None:
+        found.thickness = grads.thickness
+    return found
+
+
+def shade_backward(inputs: SimpleNamespace, grads: SimpleNamespace, targets: SimpleNamespace, window: Window) -> None:
+    """Fill the gradients `targets` of the inputs that are not None, given those of the outputs."""
+    number, device = inputs.points.dtype, inputs.points.device
+    surface, shaded = surface_arrays(vars(inputs), window), shaded_gradients(number, grads)
+    if targets.maps is not None:
+        targets.maps.zero_()
+        if grads.thickness is not None and inputs.faces.shape[0]:
+            arguments = [surface, inputs.faces, inputs.offsets, shaded, targets.maps]
+            launch(maps_bwd(number), window.pixel_count, arguments, device)
+    wanted = {name: getattr(targets, name) for name in ("points", "rgba", "thickness")}
+    if all(array is None for array in wanted.values()):
+        return
+    covered = inputs.points if inputs.covered is None else inputs.covered
+    triangles = prepare_triangles(covered, inputs.corners, window)
+    strips = cut_strips(triangles.boxes)
+    if strips.count == 0 or inputs.faces.shape[0] == 0:
+        for array in wanted.values():
+            if array is not None:
+                array.zero_()
+        return
+    strip = Strip[number]()
+    strip.surface, strip.grads = surface, shaded
+    strip.faces, strip.offsets = inputs.faces, inputs.offsets
+    strip.wants_points = int(wanted["points"] is not None)
+    sums = CornerSums()
+    for name, dtype in (("points", wp.vec3d), ("rgba", wp.vec4d), ("thickness", wp.float64)):
+        if wanted[name] is not None:
+            setattr(sums, name, wp.empty((strips.count, 3), dtype=dtype, device=device))
+    arguments = [triangles.arrays(by_band=False), strip, strips.ends, strips.faces, sums]
+    launch(shade_bwd(number, covered.dtype), strips.count, arguments, device)
+    gather_corners(inputs.corners, strips, sums, targets)
+
+
+SHADE = Operator(
+    name="shade",
+    inputs=(
+        Input("points", "V 3", gradient=True),
+        Input("rgba", "V 4", gradient=True),
+        Input("thickness", "V", gradient=True),
+        Input("maps", "maps pixels", gradient=True),
+    ),
+    tables=(
+        Input("corners", "N 3", None),
+        Input("faces", "F", None),
+        Input("offsets", "P+1", None),
+        Input("object_id", "N", None),
+        Input("objects", "objects 3", None),
+        Input("uv", "V 2", None),
+        Input("texture_id", "N", None),
+        Input("texels", "texels 4", None),
+        Input("textures", "images 3", None),
+        Input("covered", "V 3", None),
+    ),
+    outputs=(
+        Output("rgba", "F 4"),
+        Output("depth", "F"),
+        Output("thickness", "F"),
+        Output("object_id", "F", "int"),
+        Output("primitive_id", "F", "int"),
+    ),
+    options=Window,
+    forward=shade_forward,
+    backward=shade_backward,
+)

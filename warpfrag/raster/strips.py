@@ -1,20 +1,41 @@
-"""Strips: pieces of a triangle's rows, and the sum over strips and corners to vertices, in a fixed order."""
+"""Strips: pieces of a triangle's rows, small enough that a large triangle does not keep one thread busy.
 
-from collections.abc import Sequence
-from functools import cache
-from typing import Any
+What is summed up by strip and corner is then summed up by vertex, in the order of the triangles and of their strips: no
+sum depends on the number of threads.
+"""
+
+from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
 
+from warpfrag.arrays.kinds import as_vectors
 from warpfrag.arrays.launch import Span, launch
-from warpfrag.arrays.legacy import vectors
-from warpfrag.raster.triangles import MOST_FRAGMENTS
+from warpfrag.raster.cover import Area, rows_of_window
 
 wp.set_module_options({"enable_backward": False})
 
 # Pixels of a strip's box: some 0.1 ms of work.
 STRIP_PIXELS = wp.constant(1024)
+MOST_STRIPS = 2**31 - 1
+
+
+@dataclass(frozen=True)
+class Strips:
+    """The strips of all triangles, one triangle after the other.
+
+    Attributes:
+        ends: where each triangle's strips end, (N,) int32.
+        faces: the triangle of each strip, (S,) int32.
+    """
+
+    ends: wp.array
+    faces: wp.array
+
+    @property
+    def count(self) -> int:
+        """Number of strips, S."""
+        return self.faces.shape[0]
 
 
 @wp.func
@@ -23,9 +44,32 @@ def rows_of_strip(left: int, right: int) -> int:
     return wp.max(1, STRIP_PIXELS // wp.max(1, right - left))
 
 
+@wp.func
+def first_strip(strip_ends: wp.array[int], face: int) -> int:
+    """Return the first strip of a triangle."""
+    first = int(0)
+    if face > 0:
+        first = strip_ends[face - 1]
+    return first
+
+
+@wp.func
+def area_of_strip(box: wp.vec4i, number: int, width: int) -> Area:
+    """Return the rows of strip number `number` of a triangle, given its box and the width of the window."""
+    rows = rows_of_strip(box[2], box[3])
+    top = box[0] + number * rows
+    return rows_of_window(top, wp.min(top + rows, box[1]), width)
+
+
 @wp.kernel(module="unique", enable_backward=False)
 def count_strips(span: Span, boxes: wp.array[wp.vec4i], counts: wp.array[int]):
-    """Count the strips of each triangle."""
+    """Count the strips of each triangle.
+
+    Args:
+        span: the triangles.
+        boxes: rows [top, bottom) and columns [left, right), (N,).
+        counts: output, (N,).
+    """
     for face in range(span.begin + wp.tid(), span.end, span.stride):
         box = boxes[face]
         rows = rows_of_strip(box[2], box[3])
@@ -34,113 +78,64 @@ def count_strips(span: Span, boxes: wp.array[wp.vec4i], counts: wp.array[int]):
 
 @wp.kernel(module="unique", enable_backward=False)
 def number_strips(span: Span, strip_ends: wp.array[int], strip_faces: wp.array[int]):
-    """Write the triangle of each strip."""
+    """Write the triangle of each strip.
+
+    Args:
+        span: the triangles.
+        strip_ends: where each triangle's strips end, (N,).
+        strip_faces: output, (S,).
+    """
     for face in range(span.begin + wp.tid(), span.end, span.stride):
-        begin = int(0)
-        if face > 0:
-            begin = strip_ends[face - 1]
-        for strip in range(begin, strip_ends[face]):
+        for strip in range(first_strip(strip_ends, face), strip_ends[face]):
             strip_faces[strip] = face
 
 
 @wp.kernel(module="unique", enable_backward=False)
-def find_begins(span: Span, sorted: wp.array[int], begins: wp.array[int]):
-    """Write where each value's run begins in sorted values; a value that does not occur has the next one's."""
+def find_begins(span: Span, ascending: wp.array[int], begins: wp.array[int]):
+    """Write where each value's run begins in ascending values; a value that does not occur has the next one's.
+
+    Args:
+        span: the positions.
+        ascending: the values, (n,).
+        begins: output, by value, and n after the last one that may occur.
+    """
     for position in range(span.begin + wp.tid(), span.end, span.stride):
-        before = int(-1)
+        value_before = int(-1)
         if position > 0:
-            before = sorted[position - 1]
-        last = sorted[position]
-        for value in range(before + 1, last + 1):
+            value_before = ascending[position - 1]
+        last = ascending[position]
+        for value in range(value_before + 1, last + 1):
             begins[value] = position
-        if position == sorted.shape[0] - 1:
+        if position == ascending.shape[0] - 1:
             for value in range(last + 1, begins.shape[0]):
                 begins[value] = position + 1
 
 
-@cache
-def _gather_kernel(scalar: Any) -> wp.Kernel:
-    @wp.kernel(module="unique", enable_backward=False)
-    def gather(
-        span: Span,
-        vertex_begins: wp.array(dtype=int),
-        corner_numbers: wp.array(dtype=int),
-        strip_ends: wp.array(dtype=int),
-        corner_points: wp.array2d(dtype=wp.vec3d),
-        corner_rgba: wp.array2d(dtype=wp.vec4d),
-        corner_thickness: wp.array2d(dtype=wp.float64),
-        grad_points: wp.array2d(dtype=scalar),
-        grad_rgba: wp.array2d(dtype=scalar),
-        grad_thickness: wp.array(dtype=scalar),
-    ):
-        for vertex in range(span.begin + wp.tid(), span.end, span.stride):
-            sum_point = wp.vec3d()
-            sum_rgba = wp.vec4d()
-            sum_own = wp.float64(0.0)
-            for position in range(vertex_begins[vertex], vertex_begins[vertex + 1]):
-                face = corner_numbers[position] // 3
-                corner = corner_numbers[position] - 3 * face
-                begin = int(0)
-                if face > 0:
-                    begin = strip_ends[face - 1]
-                for strip in range(begin, strip_ends[face]):
-                    if corner_points.shape[0] > 0:
-                        sum_point += corner_points[strip, corner]
-                    if corner_rgba.shape[0] > 0:
-                        sum_rgba += corner_rgba[strip, corner]
-                    if corner_thickness.shape[0] > 0:
-                        sum_own += corner_thickness[strip, corner]
-            if grad_points.shape[0] > 0:
-                for axis in range(3):
-                    grad_points[vertex, axis] = scalar(sum_point[axis])
-            if grad_rgba.shape[0] > 0:
-                for channel in range(4):
-                    grad_rgba[vertex, channel] = scalar(sum_rgba[channel])
-            if grad_thickness.shape[0] > 0:
-                grad_thickness[vertex] = scalar(sum_own)
-
-    return gather
+def strip_counts(boxes: wp.array) -> tuple[wp.array, int]:
+    """Return the number of strips of each triangle, given its box, (N,) int32, and their sum."""
+    counts = wp.empty(boxes.shape[0], dtype=int, device=boxes.device)
+    launch(count_strips, boxes.shape[0], [as_vectors(boxes), counts], boxes.device)
+    return counts, int(counts.numpy().sum(dtype=np.int64))
 
 
-def gather_corners(
-    corners: wp.array, strip_ends: wp.array, sums: Sequence[wp.array], targets: Sequence[wp.array | None], scalar: Any
-) -> None:
-    """Sum the gradients of the corners, by strip, up to those of the vertices.
+def cut_strips(boxes: wp.array) -> Strips:
+    """Cut triangles into strips, given their boxes, (N, 4) int32.
 
-    Args:
-        corners: vertex of each corner, (N, 3) int32.
-        strip_ends: where each triangle's strips end, (N,) int32.
-        sums: by strip and corner the gradient of its point, colour and thickness; those without a target are empty.
-        targets: the gradients by vertex to fill, (V, 3), (V, 4) and (V,), or None.
-        scalar: Warp type of the targets.
+    Raises:
+        ValueError: there are more strips than 32-bit numbers can count.
     """
-    device = corners.device
-    vertex_count = next(target.shape[0] for target in targets if target is not None)
-    wanted = [
-        target if target is not None else wp.empty((0,) * ndim, dtype=scalar, device=device)
-        for target, ndim in zip(targets, (2, 2, 1), strict=True)
-    ]
-    vertex_begins, corner_numbers = _corners_by_vertex(corners, vertex_count)
-    launch(_gather_kernel(scalar), vertex_count, [vertex_begins, corner_numbers, strip_ends, *sums, *wanted], device)
-
-
-def cut_strips(boxes: wp.array) -> tuple[wp.array, wp.array]:
-    """Return where each triangle's strips end, counted over all triangles, and the triangle of each strip."""
-    device = boxes.device
-    counts = wp.empty(boxes.shape[0], dtype=int, device=device)
-    launch(count_strips, boxes.shape[0], [vectors(boxes), counts], device)
-    count = int(counts.numpy().sum(dtype=np.int64))
-    if count > MOST_FRAGMENTS:
-        raise ValueError(f"capture: {count} strips of triangles, expected at most {MOST_FRAGMENTS}")
+    counts, total = strip_counts(boxes)
+    if total > MOST_STRIPS:
+        raise ValueError(f"capture: got {total} strips of triangles, expected at most {MOST_STRIPS}")
     ends = wp.empty_like(counts)
-    faces = wp.empty(count, dtype=int, device=device)
+    faces = wp.empty(total, dtype=int, device=boxes.device)
     if counts.shape[0]:
         wp.utils.array_scan(counts, ends, inclusive=True)
-    launch(number_strips, boxes.shape[0], [ends, faces], device)
-    return ends, faces
+    launch(number_strips, boxes.shape[0], [ends, faces], boxes.device)
+    return Strips(ends, faces)
 
 
-def _corners_by_vertex(corners: wp.array, vertex_count: int) -> tuple[wp.array, wp.array]:
+def corners_by_vertex(corners: wp.array, vertex_count: int) -> tuple[wp.array, wp.array]:
     """Return where each vertex's corners begin in the list of their numbers, 3·triangle + corner, and that list."""
     count, device = corners.size, corners.device
     # The sort takes arrays of twice the length.

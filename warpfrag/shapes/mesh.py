@@ -1,8 +1,12 @@
 """A triangle mesh on its way into a scene: what primitives and files give, and its normals."""
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
+
+# Of what says nothing about its colour, in linear light.
+GREY = 0.8
 
 
 @dataclass(frozen=True)
@@ -11,14 +15,15 @@ class Mesh:
 
     Attributes:
         vertices: (V, 3) float64.
-        faces: (N, 3) int32, indices into ``vertices``.
+        faces: (N, 3) int32, indices into `vertices`.
         normals: (V, 3) float64 unit normals of the primitive's or file's own; None where there are none.
-        color: Straight linear RGB, (3,) or (V, 3); None where the file names no colour.
-        opacity: One number (or 0-d array) or (V,); None where the file names none.
+        color: straight linear RGB, (3,) or (V, 3); None where the file names no colour.
+        opacity: one number (or 0-d array) or (V,); None where the file names none.
         uv: (V, 2) float32 texture coordinates, v up; None without.
-        textures: Straight linear RGBA images, (h, w, 4) float32, row 0 at the top.
+        textures: straight linear RGBA images, (h, w, 4) float32, row 0 at the top.
         texture_index: (N,) int32, the image of each face, −1 for none; None where all faces have image 0 (or there is
             none).
+        name: what a file calls it; blank where it has no name.
     """
 
     vertices: np.ndarray
@@ -29,24 +34,107 @@ class Mesh:
     uv: np.ndarray | None = None
     textures: list[np.ndarray] = field(default_factory=list)
     texture_index: np.ndarray | None = None
+    name: str = ""
 
 
-def split_faces(mesh: Mesh) -> Mesh:
-    """Give every face three vertices of its own (face-major), with flat normals."""
+def named(mesh: Mesh, name: str) -> Mesh:
+    """Return a mesh under a name."""
+    return replace(mesh, name=name)
+
+
+def placed(mesh: Mesh, matrix: np.ndarray) -> Mesh:
+    """Move a mesh by a matrix (4, 4); its outside stays outside, also where the matrix mirrors it."""
+    matrix = np.asarray(matrix, dtype=np.float64)
+    if np.array_equal(matrix, np.eye(4)):
+        return mesh
+    mirrors = np.linalg.det(matrix[:3, :3]) < 0.0
+    normals = None if mesh.normals is None else transformed_normals(mesh.normals, matrix)
+    if normals is not None and mirrors:
+        normals = -normals
+    return replace(
+        mesh,
+        vertices=mesh.vertices @ matrix[:3, :3].T + matrix[:3, 3],
+        faces=np.ascontiguousarray(mesh.faces[:, ::-1]) if mirrors else mesh.faces,
+        normals=normals,
+    )
+
+
+def join(parts: list[Mesh]) -> Mesh:
+    """Put parts after one another in one mesh; parts without a colour are grey, or white under an image."""
+    if len(parts) == 1:
+        return parts[0]
+    counts = [len(part.vertices) for part in parts]
+    first = np.cumsum([0, *counts])
+    textures: list[np.ndarray] = []
+    place: dict[int, int] = {}
+    indices = []
+    for part in parts:
+        for image in part.textures:
+            if id(image) not in place:
+                place[id(image)] = len(textures)
+                textures.append(image)
+        index = part.texture_index
+        if index is None:
+            index = np.full(len(part.faces), 0 if part.textures else -1)
+        places = np.array([place[id(image)] for image in part.textures] or [-1])
+        indices.append(np.where(index < 0, -1, places[np.maximum(index, 0)]).astype(np.int32))
+    color: Any = None
+    opacity: Any = None
+    normals = uv = None
+    if any(part.color is not None for part in parts):
+        colors = [_known_color(part) for part in parts]
+        color = colors[0]
+        if any(other.ndim > 1 or not np.array_equal(other, color) for other in colors):
+            color = np.concatenate([np.broadcast_to(c, (n, 3)) for c, n in zip(colors, counts, strict=True)])
+    if any(part.opacity is not None for part in parts):
+        opacities = [np.asarray(1.0 if part.opacity is None else part.opacity) for part in parts]
+        opacity = float(opacities[0]) if opacities[0].ndim == 0 else opacities[0]
+        if any(other.ndim > 0 or other != opacity for other in opacities):
+            opacity = np.concatenate([np.broadcast_to(o, (n,)) for o, n in zip(opacities, counts, strict=True)])
+    if any(part.normals is not None for part in parts):
+        own = [smooth_normals(part.vertices, part.faces) if part.normals is None else part.normals for part in parts]
+        normals = np.concatenate(own)
+    if textures or all(part.uv is not None for part in parts):
+        blank = [np.zeros((n, 2), dtype=np.float32) for n in counts]
+        uv = np.concatenate([zero if part.uv is None else part.uv for part, zero in zip(parts, blank, strict=True)])
+    return Mesh(
+        np.concatenate([part.vertices for part in parts]),
+        np.concatenate([part.faces + np.int32(start) for part, start in zip(parts, first, strict=False)]),
+        normals,
+        color,
+        opacity,
+        uv,
+        textures,
+        np.concatenate(indices) if textures else None,
+    )
+
+
+def _known_color(part: Mesh) -> np.ndarray:
+    return np.full(3, 1.0 if part.textures else GREY) if part.color is None else np.asarray(part.color)
+
+
+def unshared(mesh: Mesh) -> Mesh:
+    """Give every face three vertices of its own, face-major; all else stays."""
     corner = mesh.faces.reshape(-1)
 
-    def pick(values):
-        return values[corner] if isinstance(values, np.ndarray) and len(values) == len(mesh.vertices) else values
+    def pick(values: Any) -> Any:
+        return values[corner] if np.ndim(values) and len(values) == len(mesh.vertices) else values
 
     return replace(
         mesh,
         vertices=mesh.vertices[corner],
         faces=np.arange(len(corner), dtype=np.int32).reshape(-1, 3),
-        normals=np.repeat(_unit_rows(_area_vectors(mesh.vertices, mesh.faces)), 3, axis=0),
+        normals=pick(mesh.normals),
         color=mesh.color if mesh.color is None or mesh.color.ndim == 1 else mesh.color[corner],
         opacity=pick(mesh.opacity),
         uv=pick(mesh.uv),
     )
+
+
+def split_faces(mesh: Mesh) -> Mesh:
+    """Give every face three vertices of its own (face-major), with flat normals."""
+    normals = np.repeat(_unit_rows(_area_vectors(mesh.vertices, mesh.faces)), 3, axis=0)
+    return replace(unshared(mesh), normals=normals)
 
 
 def weld(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -95,19 +183,19 @@ def smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def transformed_normals(normals: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """Carry normals (V, 3) through the linear part of ``matrix``; of any length, NaN-free for singular matrices."""
+    """Carry normals (V, 3) through the linear part of `matrix`; of any length, NaN-free for singular matrices."""
     # The cofactor matrix is the inverse transpose up to a factor, and exists for every matrix.
     a, b, c = np.asarray(matrix, dtype=np.float64)[:3, :3]
     return normals @ np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)]).T
 
 
 def lambert(normals: np.ndarray, towards_light: np.ndarray, ambient: float) -> np.ndarray:
-    """Return the two-sided Lambert factor ``ambient + (1 − ambient)·|n·l|`` of each vertex, (V,) float32.
+    """Return the two-sided Lambert factor `ambient + (1 − ambient)·|n·l|` of each vertex, (V,) float32.
 
     Args:
         normals: (V, 3) world-space normals of any length; a zero normal is lit by the ambient part alone.
-        towards_light: World direction towards the light, (3,) or one per vertex (V, 3), any length.
-        ambient: Share of the light that comes from everywhere, 0…1.
+        towards_light: world direction towards the light, (3,) or one per vertex (V, 3), any length.
+        ambient: share of the light that comes from everywhere, 0…1.
     """
     normals, light = _unit_rows(normals), _unit_rows(np.broadcast_to(towards_light, normals.shape))
     facing = np.minimum(np.abs(np.einsum("ij,ij->i", normals, light)), 1.0)

@@ -14,7 +14,7 @@ _TURN = 2.0 * np.pi
 
 
 def sphere(radius: float = 1.0, segments: int = 64, *, uv: bool = False) -> Mesh:
-    """Build a sphere of ``segments`` around and half as many from pole to pole."""
+    """Build a sphere of `segments` around and half as many from pole to pole."""
 
     def point(u, v):
         ring = np.sin(np.pi * v)
@@ -25,7 +25,7 @@ def sphere(radius: float = 1.0, segments: int = 64, *, uv: bool = False) -> Mesh
 
 
 def torus(radius: float = 1.0, tube: float = 0.25, segments: int = 64, *, uv: bool = False) -> Mesh:
-    """Build a torus: ``radius`` from its centre to the middle of its tube, ``tube`` the radius of that."""
+    """Build a torus: `radius` from its centre to the middle of its tube, `tube` the radius of that."""
 
     def normal(u, v):
         ring = -np.cos(_TURN * v)
@@ -75,7 +75,7 @@ def cone(radius: float = 1.0, height: float = 2.0, segments: int = 64, *, uv: bo
 
 
 def cube(size: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Mesh:
-    """Build a box with edges of ``size`` along x, y, z, four vertices a side."""
+    """Build a box with edges of `size` along x, y, z, four vertices a side."""
     sides = []
     for axis in range(3):
         for way in (1.0, -1.0):
@@ -93,7 +93,7 @@ def cube(size: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Mesh:
 
 
 def grid(size: tuple[float, float] = (1.0, 1.0), cells: tuple[int, int] = (10, 10)) -> Mesh:
-    """Build a rectangle in the x–y plane, facing +z, divided into ``cells`` along x and y."""
+    """Build a rectangle in the x–y plane, facing +z, divided into `cells` along x and y."""
 
     def point(u, v):
         return np.stack([(u - 0.5) * size[0], (v - 0.5) * size[1], 0.0 * u], axis=-1)
@@ -150,7 +150,7 @@ def _surface(
 
 
 def _disc(radius: float, y: float, segments: int, way: int, *, uv: bool) -> Mesh:
-    """Build a cap at height ``y`` that faces up (way = 1) or down (−1): a fan around its centre."""
+    """Build a cap at height `y` that faces up (way = 1) or down (−1): a fan around its centre."""
     angle = _TURN * np.arange(segments) / segments
     circle = np.stack([np.sin(angle), np.cos(angle)], axis=-1)
     vertices = np.zeros((segments + 1, 3))

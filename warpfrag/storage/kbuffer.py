@@ -5,113 +5,134 @@
     q = sum C_i w_i,  A = 1 - prod (1 - A_i),  S = sum S_i,  C = q A/S,  z = max z_i,  t = z - min (z_i - t_i)
 
 so the way back needs no sequence of states. `kbuffer_bwd` streams once more to learn which slot each fragment ended in,
-sums up the slots, and gives every member its part (`members.py`); z and the front belong to one member each.
+sums up the slots, and gives every member its part (`slot_sums.py`); z and the front belong to one member each.
 Differentiable in colour, opacity, depth, thickness and opacity sum; which fragments share a slot, and which are
 dropped, is held fixed.
 """
 
-from collections.abc import Sequence
-from functools import cache
-from typing import Any, Literal, get_args
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
 
-import numpy as np
 import warp as wp
 
+from warpfrag.arrays.apply import apply
+from warpfrag.arrays.kinds import as_vectors, common_kind
 from warpfrag.arrays.launch import Span, launch, worker_count
-from warpfrag.arrays.legacy import Operator, apply, vectors
+from warpfrag.arrays.operator import Operator
+from warpfrag.arrays.precisions import kernels
+from warpfrag.arrays.scratch import ROW_GAP
 from warpfrag.fragments import Fragments, Layers
-from warpfrag.resolve.arguments import (
-    GRADIENTS,
-    PIXELS,
-    check_choice,
-    fragment_inputs,
+from warpfrag.slabs.lists import (
+    FRAGMENT_INPUTS,
+    FragmentGradients,
+    FragmentLists,
+    fragment_gradients,
+    fragment_lists,
     longest_list,
-    report_invalid,
-    row_length,
 )
-from warpfrag.resolve.walk import NO_FRAGMENT, valid_fragment
-from warpfrag.storage.slot_sums import ZERO, Members, layer_of, member_adjoint, no_members, with_member
-from warpfrag.storage.slots import OWNS_SLOT, SLOTS, TAIL_IN_USE, finish_slots, insert, slots_in
+from warpfrag.storage.into_slots import (
+    LAYER_OUTPUTS,
+    SLOT_NUMBERS,
+    KMerge,
+    Source,
+    Tail,
+    check_kbuffer,
+    kbuffer_storage,
+)
+from warpfrag.storage.method import Room
+from warpfrag.storage.slot_sums import ZERO, SlotSums, layer_of, member_adjoint, no_sums, with_member
+from warpfrag.storage.slots import OWNS_SLOT, TAIL_IN_USE, Slots, insert, slots_in
+from warpfrag.storage.stored import stream
 
 wp.set_module_options({"enable_backward": False})
 
-KMerge = Literal["none", "order_independent"]
-Tail = Literal["mix", "discard"]
-
-KBUFFER_OPTIONS = {"slots": "int", "merge": "str", "tail": "str"}
-LAYER_OUTPUTS = ("rgba", "depth", "thickness", "opacity_sum", "count")
+# Most dimensions that a wp.array has.
+WARP_DIMENSIONS = 4
 
 
-def check_kbuffer(slots: Any, merge: Any, tail: Any) -> None:
-    """Raise for a number of slots, a merge or a tail that does not exist."""
-    check_choice("merge", merge, get_args(KMerge))
-    check_choice("tail", tail, get_args(Tail))
-    if isinstance(slots, bool) or not isinstance(slots, (int, np.integer)):
-        raise TypeError(f"slots: got {slots!r}, expected a whole number of at least 1")
-    if slots < 1:
-        raise ValueError(f"slots: got {slots}, expected at least 1")
+@dataclass(frozen=True)
+class KBufferOptions:
+    """Options of a k-buffer of stored fragments; see `kbuffer`."""
+
+    slots: int
+    merge: str
+    tail: str
+
+    def sizes(self) -> dict[str, int]:
+        """Return the size of outputs that no input has."""
+        return {"slots": self.slots}
 
 
 @wp.func(inline=True)
-def stream_fragment(slots: Any, row: int, number: int, pixels: Any, fragment: int, merging: int):
-    """Stream a stored fragment, number `number` of its pixel, into the slots of a row."""
-    rgba = pixels.rgba[fragment]
+def locate(lists: Any, pixel: int, fragment: int):
+    """Return where a stored fragment is."""
+    return fragment
+
+
+@wp.func(inline=True)
+def front_of(lists: Any, pixel: int, fragment: int, place: int, depth: Any):
+    """Return the front of a stored fragment."""
+    return depth - lists.thickness[place]
+
+
+@wp.func(inline=True)
+def color_of(lists: Any, pixel: int, fragment: int, place: int, depth: Any):
+    """Return the colour times weight and opacity of a stored fragment, and its opacity sum."""
+    rgba = lists.rgba[place]
     s = rgba[3]
     weighted = rgba
-    if pixels.opacity_sum.shape[0] > 0:
-        s = pixels.opacity_sum[fragment]
+    if lists.opacity_sum.shape[0] > 0:
+        s = lists.opacity_sum[place]
         if rgba[3] > type(s)(0.0):
             weight = s / rgba[3]
             weighted = wp.vector(weight * rgba[0], weight * rgba[1], weight * rgba[2], rgba[3])
-    z = pixels.depth[fragment]
-    front = z
-    if merging != 0:
-        front = z - pixels.thickness[fragment]
-    insert(slots, row, number, weighted, s, front, z)
+    return weighted, s
 
 
-@cache
-def _forward_kernel(scalar: Any, merging: int) -> wp.Kernel:
-    @wp.kernel(module="unique", enable_backward=False)
-    def kbuffer_fwd(span: Span, pixels: PIXELS[scalar], slots: SLOTS[scalar], invalid: wp.array2d(dtype=int)):
-        for pixel in range(span.begin + wp.tid(), span.end, span.stride):
-            begin = pixels.offsets[pixel]
-            slots.count[pixel] = 0
-            for fragment in range(begin, pixels.offsets[pixel + 1]):
-                if not valid_fragment(pixels, fragment):
-                    wp.atomic_min(invalid, span.worker, 0, fragment)
-                stream_fragment(slots, pixel, fragment - begin, pixels, fragment, merging)
-            finish_slots(slots, pixel)
-
-    return kbuffer_fwd
+STORED = Source(FragmentLists, locate, front_of, color_of)
 
 
-@cache
-def _backward_kernel(scalar: Any, merging: int) -> wp.Kernel:
-    vec4 = wp.types.vector(4, scalar)
+@kernels
+def kbuffer_bwd(number: Any, merging: bool) -> Any:
+    """Return the kernel of the way back from layers to fragments."""
+    vec4 = wp.types.vector(4, number)
+    merges = int(merging)
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def kbuffer_bwd(
+    def kernel(
         span: Span,
-        pixels: PIXELS[scalar],
-        slots: SLOTS[scalar],
+        lists: FragmentLists[number],
+        slots: Slots[number],
         length: int,
-        members: wp.array2d(dtype=Members),
-        grad_rgba: wp.array3d(dtype=scalar),
-        grad_depth: wp.array2d(dtype=scalar),
-        grad_thickness: wp.array2d(dtype=scalar),
-        grad_opacity_sum: wp.array2d(dtype=scalar),
-        grads: GRADIENTS[scalar],
+        slot_sums: wp.array2d(dtype=SlotSums),
+        layers: Slots[number],
+        grads: FragmentGradients[number],
     ):
+        """Give every fragment its part of the gradient of the layer that it ended in.
+
+        Args:
+            span: the pixels.
+            lists: the fragments.
+            slots: scratch memory, a row of K slots for each thread, with owners and parents.
+            length: entries of a thread's row of parents.
+            slot_sums: scratch memory, a row of K for each thread.
+            layers: gradients of the layers; `front` is that of thickness; empty ones are zeros.
+            grads: output, gradients of the fragments.
+        """
         row = span.worker + wp.tid()
         for pixel in range(span.begin + wp.tid(), span.end, span.stride):
-            begin = pixels.offsets[pixel]
-            end = pixels.offsets[pixel + 1]
+            begin = lists.offsets[pixel]
+            end = lists.offsets[pixel + 1]
             # The numbers of the pixel's fragments in the thread's part of `parent`.
             shift = row * length - begin
             slots.count[row] = 0
             for fragment in range(begin, end):
-                stream_fragment(slots, row, shift + fragment, pixels, fragment, merging)
+                depth = lists.depth[fragment]
+                front = depth
+                if merges != 0:
+                    front = front_of(lists, pixel, fragment, fragment, depth)
+                weighted, opacity_sum = color_of(lists, pixel, fragment, fragment, depth)
+                insert(slots, row, shift + fragment, weighted, opacity_sum, front, depth)
             layer_count = slots.count[row]
             if layer_count >= TAIL_IN_USE:
                 layer_count -= TAIL_IN_USE
@@ -119,125 +140,99 @@ def _backward_kernel(scalar: Any, merging: int) -> wp.Kernel:
                 layer_count += 1
             for layer in range(layer_count):
                 slots.parent[slots.owner[row, layer]] = OWNS_SLOT - layer
-                members[row, layer] = no_members()
+                slot_sums[row, layer] = no_sums()
             for fragment in range(begin, end):
                 layer = layer_of(slots.parent, shift + fragment)
                 if layer >= 0:
-                    members[row, layer] = with_member(members[row, layer], pixels, fragment, merging)
+                    slot_sums[row, layer] = with_member(slot_sums[row, layer], lists, fragment, merges)
             for fragment in range(begin, end):
                 layer = layer_of(slots.parent, shift + fragment)
-                to_rgba = wp.vec4d()
-                to_sum = ZERO
-                to_depth = scalar(0.0)
-                to_thickness = scalar(0.0)
+                grad_rgba = wp.vec4d()
+                grad_sum = ZERO
+                grad_depth = number(0.0)
+                grad_thickness = number(0.0)
                 if layer >= 0:
-                    m = members[row, layer]
+                    sums = slot_sums[row, layer]
                     g = wp.vec4d()
-                    if grad_rgba.shape[0] > 0:
-                        g = wp.vec4d(
-                            wp.float64(grad_rgba[pixel, layer, 0]),
-                            wp.float64(grad_rgba[pixel, layer, 1]),
-                            wp.float64(grad_rgba[pixel, layer, 2]),
-                            wp.float64(grad_rgba[pixel, layer, 3]),
-                        )
+                    if layers.rgba.shape[0] > 0:
+                        g = wp.vec4d(layers.rgba[pixel, layer])
                     g_sum = ZERO
-                    if grad_opacity_sum.shape[0] > 0:
-                        g_sum = wp.float64(grad_opacity_sum[pixel, layer])
-                    to_rgba, to_sum = member_adjoint(m, g, g_sum, pixels, fragment)
-                    if m.back == fragment and grad_depth.shape[0] > 0:
-                        to_depth += grad_depth[pixel, layer]
-                    if grad_thickness.shape[0] > 0:
-                        if m.back == fragment:
-                            to_depth += grad_thickness[pixel, layer]
-                        if m.front == fragment:
-                            to_depth -= grad_thickness[pixel, layer]
-                            if merging != 0:
-                                to_thickness = grad_thickness[pixel, layer]
+                    if layers.opacity_sum.shape[0] > 0:
+                        g_sum = wp.float64(layers.opacity_sum[pixel, layer])
+                    grad_rgba, grad_sum = member_adjoint(sums, g, g_sum, lists, fragment)
+                    if sums.back == fragment and layers.depth.shape[0] > 0:
+                        grad_depth += layers.depth[pixel, layer]
+                    if layers.front.shape[0] > 0:
+                        if sums.back == fragment:
+                            grad_depth += layers.front[pixel, layer]
+                        if sums.front == fragment:
+                            grad_depth -= layers.front[pixel, layer]
+                            if merges != 0:
+                                grad_thickness = layers.front[pixel, layer]
                 if grads.rgba.shape[0] > 0:
-                    grads.rgba[fragment] = vec4(to_rgba)
+                    grads.rgba[fragment] = vec4(grad_rgba)
                 if grads.depth.shape[0] > 0:
-                    grads.depth[fragment] = to_depth
+                    grads.depth[fragment] = grad_depth
                 if grads.thickness.shape[0] > 0:
-                    grads.thickness[fragment] = to_thickness
+                    grads.thickness[fragment] = grad_thickness
                 if grads.opacity_sum.shape[0] > 0:
-                    grads.opacity_sum[fragment] = scalar(to_sum)
+                    grads.opacity_sum[fragment] = number(grad_sum)
 
-    return kbuffer_bwd
-
-
-def _pixels(inputs: Sequence[Any]) -> Any:
-    rgba, depth, thickness, offsets, opacity_sum = inputs
-    pixels = PIXELS[rgba.dtype]()
-    pixels.rgba, pixels.depth, pixels.thickness, pixels.offsets = vectors(rgba), depth, thickness, offsets
-    if opacity_sum is not None:
-        pixels.opacity_sum = opacity_sum
-    return pixels
+    return kernel
 
 
-def _output_like(inputs: Sequence[Any], slots: int, merge: str, tail: str) -> list[tuple[tuple[int, ...], str]]:
-    return layers_like(inputs[3].shape[0] - 1, slots)
-
-
-def layers_like(pixel_count: int, slots: int) -> list[tuple[tuple[int, ...], str]]:
-    """Return the shapes and kinds of `LAYER_OUTPUTS`."""
-    per_slot = ((pixel_count, slots), "float")
-    return [((pixel_count, slots, 4), "float"), per_slot, per_slot, per_slot, ((pixel_count,), "int32")]
-
-
-def _forward(inputs: Sequence[Any], outputs: Sequence[Any], slots: int, merge: str, tail: str) -> None:
-    device, offsets = inputs[0].device, inputs[3]
-    longest_list(offsets, inputs[0].shape[0])
-    pixel_count = offsets.shape[0] - 1
-    rows = worker_count(pixel_count, device, 0)
-    invalid = wp.array(np.full((rows, 2), NO_FRAGMENT, np.int32), device=device)
-    kernel = _forward_kernel(inputs[0].dtype, int(merge != "none"))
-    launch(kernel, pixel_count, [_pixels(inputs), slots_in(*outputs, tail=tail), invalid], device, rows)
-    report_invalid(invalid, (*inputs[:4], None, inputs[4]))
+def _forward(inputs: SimpleNamespace, outputs: SimpleNamespace, options: KBufferOptions) -> None:
+    longest_list(inputs.offsets, inputs.rgba.shape[0])
+    lists = fragment_lists(inputs)
+    storage = kbuffer_storage(STORED, lists, outputs, merge=options.merge, tail=options.tail)
+    # The layers are there already; there is nothing to reserve.
+    room = Room(inputs.offsets.shape[0] - 1, inputs.rgba.dtype, inputs.rgba.device, lambda *told: None)
+    stream(storage, lists, room, inputs)
 
 
 def kbuffer_backward(
-    inputs: Sequence[Any], grad_outputs: Sequence[Any], grad_inputs: Sequence[Any], slots: int, merge: str, tail: str
+    inputs: SimpleNamespace, grads: SimpleNamespace, targets: SimpleNamespace, options: KBufferOptions
 ) -> None:
     """Fill those gradients of the fragments that are not None, given those of the layers."""
-    rgba, _, _, offsets, _ = inputs
-    scalar, device, pixel_count = rgba.dtype, rgba.device, offsets.shape[0] - 1
-    length = row_length(offsets, rgba.shape[0])
-    rows = worker_count(pixel_count, device, 4 * length + slots * (7 * wp.types.type_size_in_bytes(scalar) + 92))
-    sizes = zip(LAYER_OUTPUTS, layers_like(rows, slots), strict=True)
-    scratch = slots_in(
-        *(wp.empty(shape, dtype=scalar if kind == "float" else int, device=device) for _, (shape, kind) in sizes),
-        tail=tail,
+    number, device = inputs.rgba.dtype, inputs.rgba.device
+    pixel_count, slots = inputs.offsets.shape[0] - 1, options.slots
+    length = longest_list(inputs.offsets, inputs.rgba.shape[0]) + ROW_GAP
+    slot_bytes = SLOT_NUMBERS * wp.types.type_size_in_bytes(number) + 4 + wp.types.type_size_in_bytes(SlotSums)
+    rows = worker_count(pixel_count, device, 4 * length + slots * slot_bytes)
+    layers = SimpleNamespace(
+        rgba=wp.empty((rows, slots, 4), dtype=number, device=device),
+        **{
+            name: wp.empty((rows, slots), dtype=number, device=device) for name in ("depth", "thickness", "opacity_sum")
+        },
+        count=wp.empty(rows, dtype=int, device=device),
     )
+    scratch = slots_in(layers, options.tail)
     scratch.owner = wp.empty((rows, slots), dtype=int, device=device)
     scratch.parent = wp.empty(rows * length, dtype=int, device=device)
-    members = wp.empty((rows, slots), dtype=Members, device=device)
-    targets = GRADIENTS[scalar]()
-    grad_rgba, grad_depth, grad_thickness, _, grad_opacity_sum = grad_inputs
-    if grad_rgba is not None:
-        targets.rgba = vectors(grad_rgba)
-    if grad_depth is not None:
-        targets.depth = grad_depth
-    if grad_thickness is not None:
-        targets.thickness = grad_thickness
-    if grad_opacity_sum is not None:
-        targets.opacity_sum = grad_opacity_sum
-    grads = [
-        grad if grad is not None else wp.empty((0,) * ndim, dtype=scalar, device=device)
-        for grad, ndim in zip(grad_outputs[:4], (3, 2, 2, 2), strict=True)
-    ]
-    arguments = [_pixels(inputs), scratch, length, members, *grads, targets]
-    launch(_backward_kernel(scalar, int(merge != "none")), pixel_count, arguments, device, rows)
+    slot_sums = wp.empty((rows, slots), dtype=SlotSums, device=device)
+    layer_grads = layer_gradients(grads, number)
+    arguments = [fragment_lists(inputs), scratch, length, slot_sums, layer_grads, fragment_gradients(targets, number)]
+    launch(kbuffer_bwd(number, options.merge != "none"), pixel_count, arguments, device, rows)
 
 
-_KBUFFER = Operator(
+def layer_gradients(grads: SimpleNamespace, number: Any) -> Any:
+    """Return the gradients of layers that are not None as the arrays of `Slots`; `front` is that of thickness."""
+    found = Slots[number]()
+    if grads.rgba is not None:
+        found.rgba = as_vectors(grads.rgba)
+    for field, name in (("depth", "depth"), ("front", "thickness"), ("opacity_sum", "opacity_sum")):
+        if getattr(grads, name) is not None:
+            setattr(found, field, getattr(grads, name))
+    return found
+
+
+KBUFFER = Operator(
     name="kbuffer",
-    tensors=("rgba", "depth", "thickness", "offsets", "opacity_sum"),
-    differentiable=("rgba", "depth", "thickness", "opacity_sum"),
+    inputs=FRAGMENT_INPUTS,
     outputs=LAYER_OUTPUTS,
-    output_like=_output_like,
+    options=KBufferOptions,
     forward=_forward,
     backward=kbuffer_backward,
-    options=KBUFFER_OPTIONS,
 )
 
 
@@ -273,18 +268,36 @@ def kbuffer(fragments: Fragments, slots: int = 8, merge: KMerge = "order_indepen
         (512, 512, 4)
     """
     check_kbuffer(slots, merge, tail)
-    *inputs, _, opacity_sum = fragment_inputs(fragments, 1.0, dimensions=2)
-    options = {"slots": int(slots), "merge": merge, "tail": tail}
-    return as_layers(apply(_KBUFFER, (*inputs, opacity_sum), **options), fragments.shape, slots)
+    options = KBufferOptions(int(slots), merge, tail)
+    return as_layers(apply(KBUFFER, fragment_arrays(fragments), options), fragments.shape, options.slots)
 
 
-def as_layers(outputs: Sequence[Any], grid: tuple[int, ...], slots: int) -> Layers:
+def fragment_arrays(fragments: Fragments) -> dict[str, Any]:
+    """Return the arrays of fragments by the names of `FRAGMENT_INPUTS`.
+
+    Raises:
+        TypeError: they are no `Fragments`.
+        ValueError: a wp.array has no room for as many dimensions as layers of this grid would have.
+    """
+    if not isinstance(fragments, Fragments):
+        raise TypeError(f"fragments: got {type(fragments).__name__}, expected Fragments")
+    most = WARP_DIMENSIONS - 2
+    kind = common_kind({"rgba": fragments.rgba})
+    if kind.name == "warp" and len(fragments.shape) > most:
+        raise ValueError(
+            f"fragments: got shape {fragments.shape}, expected at most {most} dimensions: a wp.array has at most "
+            f"{WARP_DIMENSIONS}, of which the result takes 2 more"
+        )
+    arrays = {each.name: getattr(fragments, each.name) for each in FRAGMENT_INPUTS}
+    return {**arrays, "offsets": kind.astype(fragments.offsets, "int32")}
+
+
+def as_layers(outputs: SimpleNamespace, grid: tuple[int, ...], slots: int) -> Layers:
     """Return `LAYER_OUTPUTS` of all pixels in one row as the layers of a pixel grid."""
-    rgba, depth, thickness, opacity_sum, count = outputs
     return Layers(
-        rgba.reshape((*grid, slots, 4)),
-        depth.reshape((*grid, slots)),
-        thickness.reshape((*grid, slots)),
-        opacity_sum.reshape((*grid, slots)),
-        count.reshape(grid),
+        outputs.rgba.reshape((*grid, slots, 4)),
+        outputs.depth.reshape((*grid, slots)),
+        outputs.thickness.reshape((*grid, slots)),
+        outputs.opacity_sum.reshape((*grid, slots)),
+        outputs.count.reshape(grid),
     )

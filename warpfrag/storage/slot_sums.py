@@ -22,7 +22,7 @@ ZERO = wp.constant(wp.float64(0.0))
 
 
 @wp.struct
-class Members:
+class SlotSums:
     """Sums over the members of a slot: of colour times weight, opacity, S - A, S; prod (1 - A) of those below 1.
 
     `opaque`: number of the others; `back`, `front`: fragments that reach farthest back and front.
@@ -41,14 +41,14 @@ class Members:
 @wp.func(inline=True)
 def layer_of(parent: wp.array[wp.int32], number: int):
     """Return the layer that a fragment ended in, or -1 if it was dropped; shortens the paths of those that follow."""
-    at = int(number)
-    above = int(parent[at])
+    place = int(number)
+    above = int(parent[place])
     while above >= 0:
-        next = parent[above]
-        if next >= 0:
-            parent[at] = next
-        at = above
-        above = next
+        following = parent[above]
+        if following >= 0:
+            parent[place] = following
+        place = above
+        above = following
     layer = int(-1)
     if above != DROPPED:
         layer = OWNS_SLOT - above
@@ -56,96 +56,96 @@ def layer_of(parent: wp.array[wp.int32], number: int):
 
 
 @wp.func(inline=True)
-def load_member(pixels: Any, fragment: int):
+def load_member(lists: Any, fragment: int):
     """Return colour and opacity, opacity sum and weight of a fragment, in double precision."""
-    rgba = wp.vec4d(pixels.rgba[fragment])
+    rgba = wp.vec4d(lists.rgba[fragment])
     s = rgba[3]
     weight = ONE
-    if pixels.opacity_sum.shape[0] > 0:
-        s = wp.float64(pixels.opacity_sum[fragment])
+    if lists.opacity_sum.shape[0] > 0:
+        s = wp.float64(lists.opacity_sum[fragment])
         if rgba[3] > ZERO:
             weight = s / rgba[3]
     return rgba, s, weight
 
 
 @wp.func(inline=True)
-def front_of(pixels: Any, fragment: int, merging: int):
+def front_of(lists: Any, fragment: int, merging: int):
     """Return where a fragment begins, in the precision in which it was streamed."""
-    front = pixels.depth[fragment]
+    front = lists.depth[fragment]
     if merging != 0:
-        front = front - pixels.thickness[fragment]
+        front = front - lists.thickness[fragment]
     return front
 
 
 @wp.func(inline=True)
-def with_member(m: Members, pixels: Any, fragment: int, merging: int):
+def with_member(sums: SlotSums, lists: Any, fragment: int, merging: int):
     """Return the sums with one member more."""
-    rgba, s, weight = load_member(pixels, fragment)
-    sum = Members()
-    sum.color = m.color + weight * wp.vec3d(rgba[0], rgba[1], rgba[2])
-    sum.opacity = m.opacity + (ONE - m.opacity) * rgba[3]
-    sum.excess = m.excess + m.opacity * rgba[3]
-    sum.opacity_sum = m.opacity_sum + s
-    sum.through = m.through
-    sum.opaque = m.opaque
+    rgba, s, weight = load_member(lists, fragment)
+    more = SlotSums()
+    more.color = sums.color + weight * wp.vec3d(rgba[0], rgba[1], rgba[2])
+    more.opacity = sums.opacity + (ONE - sums.opacity) * rgba[3]
+    more.excess = sums.excess + sums.opacity * rgba[3]
+    more.opacity_sum = sums.opacity_sum + s
+    more.through = sums.through
+    more.opaque = sums.opaque
     if rgba[3] < ONE:
-        sum.through = m.through * (ONE - rgba[3])
+        more.through = sums.through * (ONE - rgba[3])
     else:
-        sum.opaque = m.opaque + 1
-    sum.back = m.back
-    if m.back < 0 or pixels.depth[fragment] > pixels.depth[m.back]:
-        sum.back = fragment
-    sum.front = m.front
-    if m.front < 0 or front_of(pixels, fragment, merging) < front_of(pixels, m.front, merging):
-        sum.front = fragment
-    return sum
+        more.opaque = sums.opaque + 1
+    more.back = sums.back
+    if sums.back < 0 or lists.depth[fragment] > lists.depth[sums.back]:
+        more.back = fragment
+    more.front = sums.front
+    if sums.front < 0 or front_of(lists, fragment, merging) < front_of(lists, sums.front, merging):
+        more.front = fragment
+    return more
 
 
 @wp.func(inline=True)
-def no_members():
+def no_sums():
     """Return the sums over nothing."""
-    m = Members()
-    m.through = ONE
-    m.back = -1
-    m.front = -1
-    return m
+    sums = SlotSums()
+    sums.through = ONE
+    sums.back = -1
+    sums.front = -1
+    return sums
 
 
 @wp.func(inline=True)
-def rest_of(m: Members, opacity: wp.float64):
+def rest_of(sums: SlotSums, opacity: wp.float64):
     """Return the transmittance of all members but one of this opacity, and 1 minus that."""
     rest = ZERO
     if opacity < ONE:
-        if m.opaque == 0:
-            rest = m.through / (ONE - opacity)
-            return rest, wp.max(m.opacity - opacity, ZERO) / (ONE - opacity)
-    elif m.opaque == 1:
-        rest = m.through
+        if sums.opaque == 0:
+            rest = sums.through / (ONE - opacity)
+            return rest, wp.max(sums.opacity - opacity, ZERO) / (ONE - opacity)
+    elif sums.opaque == 1:
+        rest = sums.through
     return rest, ONE - rest
 
 
 @wp.func(inline=True)
-def member_adjoint(m: Members, g: wp.vec4d, g_sum: wp.float64, pixels: Any, fragment: int):
+def member_adjoint(sums: SlotSums, g: wp.vec4d, g_sum: wp.float64, lists: Any, fragment: int):
     """Return a member's gradients in colour and opacity and in the opacity sum, given those of the layer."""
-    rgba, s, weight = load_member(pixels, fragment)
+    rgba, s, weight = load_member(lists, fragment)
     g_color = wp.vec3d(g[0], g[1], g[2])
-    rest, rest_opacity = rest_of(m, rgba[3])
+    rest, rest_opacity = rest_of(sums, rgba[3])
     g_opacity = g[3] * rest
     g_own_sum = g_sum
     scale = ONE
-    if m.opacity_sum > ZERO and m.opacity > ZERO:
-        scale = m.opacity / m.opacity_sum
-        along = wp.dot(g_color, m.color)
-        if pixels.opacity_sum.shape[0] > 0:
-            g_opacity += along * rest / m.opacity_sum
-            g_own_sum -= along * scale / m.opacity_sum
+    if sums.opacity_sum > ZERO and sums.opacity > ZERO:
+        scale = sums.opacity / sums.opacity_sum
+        along = wp.dot(g_color, sums.color)
+        if lists.opacity_sum.shape[0] > 0:
+            g_opacity += along * rest / sums.opacity_sum
+            g_own_sum -= along * scale / sums.opacity_sum
             if rgba[3] > ZERO:
                 own = scale * wp.dot(g_color, wp.vec3d(rgba[0], rgba[1], rgba[2])) / rgba[3]
                 g_own_sum += own
                 g_opacity -= own * weight
         else:
-            g_opacity += along * (m.excess / m.opacity_sum - rest_opacity) / m.opacity_sum
-    if pixels.opacity_sum.shape[0] == 0:
+            g_opacity += along * (sums.excess / sums.opacity_sum - rest_opacity) / sums.opacity_sum
+    if lists.opacity_sum.shape[0] == 0:
         g_opacity += g_sum
     g_color = scale * weight * g_color
     return wp.vec4d(g_color[0], g_color[1], g_color[2], g_opacity), g_own_sum

@@ -1,6 +1,6 @@
 """The slots of a bounded k-buffer, and how one more fragment enters them (fragment merging section 4.2; k+-buffer).
 
-A slot holds sums, so that mixing costs a few additions and its members may come in any order:
+A slot holds sums, so that mixing costs a few additions and its fragments may come in any order:
 
     q = sum C_i w_i,   A = 1 - prod (1 - A_i),   S = sum S_i,   front = min f_i,   z = max z_i,   w_i = S_i / A_i
 
@@ -22,6 +22,9 @@ from typing import Any
 
 import warp as wp
 
+from warpfrag.arrays.kinds import as_vectors
+from warpfrag.arrays.precisions import Array, Array2, Number, Vector4, in_precisions
+
 wp.set_module_options({"enable_backward": False})
 
 # Added to a pixel's number of core slots when its tail is in use; the tail's own place is the last slot.
@@ -31,56 +34,32 @@ DROPPED = wp.constant(-1)
 OWNS_SLOT = wp.constant(-2)
 
 
-@wp.struct
-class Slots32:
+@in_precisions
+class Slots:
     """Slots of all pixels, (P, K): `rgba` and `front` as said above; `core` of them are no tail, `tail` is 0 or 1.
 
     Only the way back keeps `owner` (P, K), the fragment that a slot began with, and `parent`, by fragment of a pixel:
     the one whose slot it went into.
     """
 
-    rgba: wp.array2d[wp.vec4f]
-    depth: wp.array2d[wp.float32]
-    front: wp.array2d[wp.float32]
-    opacity_sum: wp.array2d[wp.float32]
-    count: wp.array[wp.int32]
+    rgba: Array2[Vector4]
+    depth: Array2[Number]
+    front: Array2[Number]
+    opacity_sum: Array2[Number]
+    count: Array[wp.int32]
     core: wp.int32
     tail: wp.int32
-    owner: wp.array2d[wp.int32]
-    parent: wp.array[wp.int32]
+    owner: Array2[wp.int32]
+    parent: Array[wp.int32]
 
 
-@wp.struct
-class Slots64:
-    """`Slots32` in double precision."""
-
-    rgba: wp.array2d[wp.vec4d]
-    depth: wp.array2d[wp.float64]
-    front: wp.array2d[wp.float64]
-    opacity_sum: wp.array2d[wp.float64]
-    count: wp.array[wp.int32]
-    core: wp.int32
-    tail: wp.int32
-    owner: wp.array2d[wp.int32]
-    parent: wp.array[wp.int32]
-
-
-SLOTS: Any = {wp.float32: Slots32, wp.float64: Slots64}
-
-
-def slots_in(
-    rgba: wp.array, depth: wp.array, front: wp.array, opacity_sum: wp.array, count: wp.array, *, tail: str
-) -> Any:
-    """Return the slots that live in the arrays of layers, (P, K, 4), (P, K) and (P,)."""
-    slots = SLOTS[depth.dtype]()
-    vec4 = wp.types.vector(4, depth.dtype)
-    view = wp.array(ptr=rgba.ptr, dtype=vec4, shape=depth.shape, device=depth.device)
-    # A view by address does not keep its memory alive by itself.
-    view._ref = rgba
-    slots.rgba = view
-    slots.depth, slots.front, slots.opacity_sum, slots.count = depth, front, opacity_sum, count
+def slots_in(layers: Any, tail: str) -> Any:
+    """Return the slots that live in the arrays of layers, with attributes of (P, K, 4), (P, K) and (P,)."""
+    slots = Slots[layers.depth.dtype]()
+    slots.rgba, slots.depth, slots.front = as_vectors(layers.rgba), layers.depth, layers.thickness
+    slots.opacity_sum, slots.count = layers.opacity_sum, layers.count
     slots.tail = int(tail == "mix")
-    slots.core = depth.shape[1] - slots.tail
+    slots.core = layers.depth.shape[1] - slots.tail
     return slots
 
 
@@ -96,9 +75,9 @@ def set_slot(slots: Any, pixel: int, slot: int, rgba: Any, s: Any, front: Any, z
 @wp.func(inline=True)
 def mix_into(slots: Any, pixel: int, slot: int, rgba: Any, s: Any, front: Any, z: Any):
     """Mix into a slot (order-independent merging)."""
-    sum = slots.rgba[pixel, slot]
-    opacity = sum[3] + (type(s)(1.0) - sum[3]) * rgba[3]
-    slots.rgba[pixel, slot] = wp.vector(sum[0] + rgba[0], sum[1] + rgba[1], sum[2] + rgba[2], opacity)
+    own = slots.rgba[pixel, slot]
+    opacity = own[3] + (type(s)(1.0) - own[3]) * rgba[3]
+    slots.rgba[pixel, slot] = wp.vector(own[0] + rgba[0], own[1] + rgba[1], own[2] + rgba[2], opacity)
     slots.opacity_sum[pixel, slot] = slots.opacity_sum[pixel, slot] + s
     slots.front[pixel, slot] = wp.min(slots.front[pixel, slot], front)
     slots.depth[pixel, slot] = wp.max(slots.depth[pixel, slot], z)
@@ -233,11 +212,11 @@ def finish_slots(slots: Any, pixel: int):
         layer_count += 1
     slots.count[pixel] = layer_count
     for layer in range(layer_count):
-        sum = slots.rgba[pixel, layer]
+        own = slots.rgba[pixel, layer]
         s = slots.opacity_sum[pixel, layer]
-        if s > type(s)(0.0) and sum[3] > type(s)(0.0):
-            scale = sum[3] / s
-            slots.rgba[pixel, layer] = wp.vector(scale * sum[0], scale * sum[1], scale * sum[2], sum[3])
+        if s > type(s)(0.0) and own[3] > type(s)(0.0):
+            scale = own[3] / s
+            slots.rgba[pixel, layer] = wp.vector(scale * own[0], scale * own[1], scale * own[2], own[3])
         slots.front[pixel, layer] = slots.depth[pixel, layer] - slots.front[pixel, layer]
     for unused in range(layer_count, slots.depth.shape[1]):
         zero = type(slots.depth[pixel, unused])(0.0)

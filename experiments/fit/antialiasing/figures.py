@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from warpfrag.files.images import linear_to_srgb
+from warpfrag.colors import linear_to_srgb
 
 STYLE = {"font.size": 9, "axes.titlesize": 9, "axes.spines.top": False, "axes.spines.right": False}
 SHADES = {"cube and sphere": "#1f78b4", "another view": "#33a02c", "half the size": "#ff7f00", "cylinders": "#6a3d9a"}

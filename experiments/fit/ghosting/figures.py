@@ -13,7 +13,7 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from target import Target, pen_line
 
-from warpfrag.files.images import linear_to_srgb
+from warpfrag.colors import linear_to_srgb
 
 STYLE = {"font.size": 9, "axes.titlesize": 9}
 # Root mean square over the channels at which the colours of the error end [linear light].

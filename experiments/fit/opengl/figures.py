@@ -6,7 +6,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 import warpfrag as wf
-from warpfrag.files.images import linear_to_srgb
+from warpfrag.colors import linear_to_srgb
 from warpfrag.fit.losses import psnr
 
 STYLE = {"font.size": 9, "axes.titlesize": 9, "axes.spines.top": False, "axes.spines.right": False}

@@ -6,7 +6,7 @@ import numpy as np
 import trimesh
 
 import warpfrag as wf
-from warpfrag.files.images import linear_to_srgb
+from warpfrag.colors import linear_to_srgb
 from warpfrag.files.meshes import load_mesh
 from warpfrag.scene.camera import Camera
 from warpfrag.scene.scene import Scene

@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from tied import Tied
 
-from warpfrag.files.images import linear_to_srgb
+from warpfrag.colors import linear_to_srgb
 from warpfrag.fit.losses import psnr
-from warpfrag.resolve.arguments import Merge
+from warpfrag.scene.names import Merge
 
 STYLE = {
     "font.size": 9,

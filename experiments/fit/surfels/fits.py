@@ -9,7 +9,7 @@ from discs import Discs
 import warpfrag as wf
 from warpfrag.fit import FitParameter, FitResult, Study, View
 from warpfrag.fit.losses import psnr
-from warpfrag.resolve.arguments import Merge
+from warpfrag.scene.names import Merge
 from warpfrag.scene.scene import Scene
 
 OPAQUE, FALLOFF = "opaque", "falloff"

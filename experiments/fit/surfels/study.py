@@ -24,7 +24,7 @@ from warpfrag.capture.coverage import Coverage  # noqa: E402
 from warpfrag.files.images import write_image  # noqa: E402
 from warpfrag.fit import Progress, Reference, load_study  # noqa: E402
 from warpfrag.fit.losses import psnr  # noqa: E402
-from warpfrag.resolve.arguments import Merge  # noqa: E402
+from warpfrag.scene.names import Merge  # noqa: E402
 from warpfrag.shapes.mesh import Mesh  # noqa: E402
 from warpfrag.studies.summary import Figure, Summary, Table  # noqa: E402
 

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from planes import BUFFERS, Setting, make_pair
 from speckle import FEW, VISIBLE, WAYS, composite
 
-from warpfrag.files.images import linear_to_srgb
+from warpfrag.colors import linear_to_srgb
 
 NAMES = {
     "eye": "float32 distance (warpfrag)",

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 import warpfrag as wf
-from warpfrag.capture.capture import to_camera_space
+from warpfrag.capture.surfaces import to_camera_space
 from warpfrag.scene.assemble import assemble
 from warpfrag.scene.camera import Camera
 from warpfrag.scene.scene import Scene

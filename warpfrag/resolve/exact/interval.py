@@ -18,26 +18,19 @@ from typing import Any
 
 import warp as wp
 
-from warpfrag.resolve.exact.sweep import cut_slab, cut_slab_adjoint, fragment_beta, light_to, part_share
-from warpfrag.slabs.operators import MIX_OPTICAL_DEPTH
-from warpfrag.slabs.slab import (
-    NEGLIGIBLE,
-    SERIES_OPACITY,
-    WEIGHT_LIMIT,
-    depth_per_opacity,
-    depth_per_opacity_gradient,
-    divide,
-    slab,
-)
+from warpfrag.resolve.exact.cut import cut_slab, cut_slab_adjoint, light_to, part_share
+from warpfrag.resolve.exact.sweep import fragment_beta
+from warpfrag.slabs.mix import MIX_OPTICAL_DEPTH, depth_per_opacity, depth_per_opacity_gradient
+from warpfrag.slabs.slab import NEGLIGIBLE, SERIES_OPACITY, WEIGHT_LIMIT, divide
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.func(inline=True)
-def member(sweep: Any, strip: Any, base: int, slot: int):
+def position_of(sweep: Any, scratch: Any, base: int, slot: int):
     """Return the position of a member of the present interval: the active slabs, then the surfaces."""
     if slot < sweep.active:
-        return strip.active[base + slot]
+        return scratch.active[base + slot]
     return sweep.entered + slot - sweep.active
 
 
@@ -48,11 +41,11 @@ def part_weight(s: Any, opacity: Any, passed: Any, mix: int):
         if passed <= type(passed)(NEGLIGIBLE):
             return type(passed)(1.0), True
         return depth_per_opacity(opacity, passed), False
-    return s.w, False
+    return s.weight, False
 
 
 @wp.func(inline=True)
-def blend(sweep: Any, pixels: Any, pixel: int, strip: Any, base: int, mix: int, beta_per: int):
+def blend(sweep: Any, lists: Any, pixel: int, scratch: Any, base: int, mix: int, beta_per: int):
     """Return colour, transmittance and opacity sum of the present interval; its members move on to its end."""
     zero = type(sweep.end)(0.0)
     one = type(sweep.end)(1.0)
@@ -66,25 +59,25 @@ def blend(sweep: Any, pixels: Any, pixel: int, strip: Any, base: int, mix: int, 
     first = wp.where(sweep.surfaces > 0, sweep.active, 0)
     count = sweep.active + sweep.surfaces
     for slot in range(first, count):
-        position = member(sweep, strip, base, slot)
-        s = strip.fragment[base + position]
-        beta = fragment_beta(pixels, pixel, strip.order[base + position], beta_per)
-        r, power, rest = cut_slab(s, sweep.end, beta, pixels.floor)
-        share, passed = part_share(s, strip.rest[base + position], rest)
-        strip.rest[base + position] = rest
-        a = s.a * share
+        position = position_of(sweep, scratch, base, slot)
+        s = scratch.fragment[base + position]
+        beta = fragment_beta(lists, pixel, scratch.order[base + position], beta_per)
+        r, power, rest = cut_slab(s, sweep.end, beta, lists.floor)
+        share, passed = part_share(s, scratch.rest[base + position], rest)
+        scratch.rest[base + position] = rest
+        opacity_of_part = s.opacity * share
         if count - first > 1:
-            weight, opaque = part_weight(s, a, passed, mix)
+            weight, opaque = part_weight(s, opacity_of_part, passed, mix)
             if opaque:
                 opaque_count += 1
-                opaque_color += share * s.c
-            color += share * weight * s.c
-            total += a * weight
+                opaque_color += share * s.color
+            color += share * weight * s.color
+            total += opacity_of_part * weight
         else:
-            color = share * s.c
-        opacity += tau * a
+            color = share * s.color
+        opacity += tau * opacity_of_part
         tau *= passed
-        opacity_sum += a * s.w
+        opacity_sum += opacity_of_part * s.weight
     if opaque_count > 0:
         color = opaque_color / type(sweep.end)(opaque_count)
     elif count - first > 1:
@@ -96,17 +89,94 @@ def blend(sweep: Any, pixels: Any, pixel: int, strip: Any, base: int, mix: int, 
 def absorption_slope(u: Any, tau: Any, scale: Any):
     """Return the derivative of scale = (1 - e^-u)/u, given tau = e^-u."""
     if u < type(u)(SERIES_OPACITY):
-        sum = type(u)(1.0)
+        total = type(u)(1.0)
         for i in range(6):
             n = type(u)(6 - i)
-            sum = type(u)(1.0) - u * (n + type(u)(1.0)) / (n * (n + type(u)(2.0))) * sum
-        return type(u)(-0.5) * sum
+            total = type(u)(1.0) - u * (n + type(u)(1.0)) / (n * (n + type(u)(2.0))) * total
+        return type(u)(-0.5) * total
     return (tau - scale) / u
 
 
 @wp.func(inline=True)
+def cut_member(g: Any, sweep: Any, lists: Any, pixel: int, scratch: Any, base: int, slot: int, mix: int, beta_per: int):
+    """Write what a member's part is in the present interval, and where it is cut at the interval's end.
+
+    Returns:
+        Opacity, transmittance and weight of the part, <g, C q v>, and whether it is opaque.
+    """
+    at = base + position_of(sweep, scratch, base, slot)
+    s = scratch.fragment[at]
+    if sweep.surfaces > 0 and slot < sweep.active:
+        # Slabs around surfaces take part with no length.
+        scratch.next_cut[at] = scratch.cut[at]
+        scratch.next_power[at] = scratch.power[at]
+        scratch.next_rest[at] = scratch.rest[at]
+    else:
+        beta = fragment_beta(lists, pixel, scratch.order[at], beta_per)
+        cut, power, rest = cut_slab(s, sweep.end, beta, lists.floor)
+        scratch.next_cut[at] = cut
+        scratch.next_power[at] = power
+        scratch.next_rest[at] = rest
+    share, passed = part_share(s, scratch.rest[at], scratch.next_rest[at])
+    a = s.opacity * share
+    weight, opaque = part_weight(s, a, passed, mix)
+    scratch.share[at] = share
+    scratch.passed[at] = passed
+    scratch.weight[at] = weight
+    return a, passed, weight, share * weight * wp.dot(g, s.color), opaque
+
+
+@wp.func(inline=True)
+def cut_adjoint(g_share: Any, g_opacity: Any, g_passed: Any, scratch: Any, at: int, beta: Any, floor: Any):
+    """Take the gradients in a part's share, opacity (by its slab's) and transmittance to its slab and its cuts.
+
+    share = (rest - next_rest) / D, passed = D' / D with D, D' = T + A rest, T + A next_rest. The cut at the interval's
+    begin also ended the interval before: its gradient is complete, and goes on to the slab.
+
+    Returns:
+        The gradient in the depth of the interval's begin.
+    """
+    zero = type(g_share)(0.0)
+    one = type(g_share)(1.0)
+    s = scratch.fragment[at]
+    share = scratch.share[at]
+    rest = scratch.rest[at]
+    next_rest = scratch.next_rest[at]
+    before = light_to(s, rest)
+    per_before = divide(one, before, zero)
+    g_before = -(g_share * share + g_passed * scratch.passed[at]) * per_before
+    g_after = g_passed * per_before
+    g_rest = g_share * per_before
+    g_next_rest = s.opacity * g_after - g_rest
+    g_depth = type(g_share)(0.0)
+    grad = scratch.grad[at]
+    grad.opacity = grad.opacity + g_opacity * share + g_after * next_rest
+    grad.transmittance = grad.transmittance + g_after
+    if rest < one:
+        grad.opacity = grad.opacity + g_before * rest
+        grad.transmittance = grad.transmittance + g_before
+        g_rest += s.opacity * g_before
+    if scratch.cut[at] > zero:
+        cut_opacity, cut_log_t, cut_front, cut_back, cut_depth, cut_beta = cut_slab_adjoint(
+            g_rest + scratch.grad_rest[at], s, scratch.cut[at], scratch.power[at], beta, floor
+        )
+        grad.opacity = grad.opacity + cut_opacity
+        grad.log_transmittance = grad.log_transmittance + cut_log_t
+        grad.front = grad.front + cut_front
+        grad.back = grad.back + cut_back
+        g_depth = cut_depth
+        scratch.grad_beta[at] = scratch.grad_beta[at] + cut_beta
+    scratch.grad[at] = grad
+    scratch.grad_rest[at] = g_next_rest
+    scratch.rest[at] = next_rest
+    scratch.cut[at] = scratch.next_cut[at]
+    scratch.power[at] = scratch.next_power[at]
+    return g_depth
+
+
+@wp.func(inline=True)
 def blend_adjoint(
-    g: Any, g_tau: Any, g_sum: Any, sweep: Any, pixels: Any, pixel: int, strip: Any, base: int, mix: int, beta_per: int
+    g: Any, g_tau: Any, g_sum: Any, sweep: Any, lists: Any, pixel: int, scratch: Any, base: int, mix: int, beta_per: int
 ):
     """Add the gradients of <g, colour> + g_tau tau + g_sum (opacity sum) to those of the fragments concerned."""
     zero = type(g_tau)(0.0)
@@ -120,29 +190,13 @@ def blend_adjoint(
     missing = type(g_tau)(0.0)
     g_scale = type(g_tau)(0.0)
     for slot in range(count):
-        at = base + member(sweep, strip, base, slot)
-        s = strip.fragment[at]
-        if sweep.surfaces > 0 and slot < sweep.active:
-            strip.next_r[at] = strip.r[at]
-            strip.next_power[at] = strip.power[at]
-            strip.next_rest[at] = strip.rest[at]
-        else:
-            beta = fragment_beta(pixels, pixel, strip.order[at], beta_per)
-            r, power, rest = cut_slab(s, sweep.end, beta, pixels.floor)
-            strip.next_r[at] = r
-            strip.next_power[at] = power
-            strip.next_rest[at] = rest
-        share, passed = part_share(s, strip.rest[at], strip.next_rest[at])
-        a = s.a * share
-        weight, opaque = part_weight(s, a, passed, mix)
-        strip.share[at] = share
-        strip.pass_[at] = passed
-        strip.weight[at] = weight
-        strip.prefix[at] = tau
-        strip.veil[at] = opacity
+        a, passed, weight, shown, opaque = cut_member(g, sweep, lists, pixel, scratch, base, slot, mix, beta_per)
+        at = base + position_of(sweep, scratch, base, slot)
+        scratch.transmittance_before[at] = tau
+        scratch.opacity_before[at] = opacity
         if opaque:
             opaque_count += 1
-        g_scale += share * weight * wp.dot(g, s.c)
+        g_scale += shown
         total += a * weight
         missing += a * (weight - one + opacity)
         opacity += tau * a
@@ -158,28 +212,24 @@ def blend_adjoint(
         missing = divide(missing, total, zero)
         if mix == MIX_OPTICAL_DEPTH:
             slope = g_scale * absorption_slope(total, tau, scale)
-    suffix = type(g_tau)(1.0)
-    suffix_veil = type(g_tau)(0.0)
+    tau_behind = type(g_tau)(1.0)
+    opacity_behind = type(g_tau)(0.0)
     g_depth = type(g_tau)(0.0)
     for back in range(count):
-        position = member(sweep, strip, base, count - 1 - back)
-        at = base + position
-        s = strip.fragment[at]
-        share = strip.share[at]
-        passed = strip.pass_[at]
-        rest = strip.rest[at]
-        next_rest = strip.next_rest[at]
-        a = s.a * share
-        weight = strip.weight[at]
+        at = base + position_of(sweep, scratch, base, count - 1 - back)
+        s = scratch.fragment[at]
+        share = scratch.share[at]
+        passed = scratch.passed[at]
+        a = s.opacity * share
+        weight = scratch.weight[at]
         if count == 1:
             weight = one
         elif opaque_count > 0:
             weight = wp.where(passed <= type(g_tau)(NEGLIGIBLE), one / type(g_tau)(opaque_count), zero)
-        projection = wp.dot(g, s.c)
-        g_share = projection * weight * scale
-        g_a = g_sum * s.w
+        projection = wp.dot(g, s.color)
+        g_a = g_sum * s.weight
         g_w = g_sum * a
-        g_passed = g_tau * strip.prefix[at] * suffix
+        g_passed = g_tau * scratch.transmittance_before[at] * tau_behind
         if varies:
             g_weight = projection * share * scale
             if mix == MIX_OPTICAL_DEPTH:
@@ -192,58 +242,29 @@ def blend_adjoint(
                 g_w += wp.clamp(g_weight, -most, most)
                 if total > type(g_tau)(NEGLIGIBLE) and scale < limit:
                     # scale = (1 - tau) / total: its derivative is (others - weight * scale) / total.
-                    others_veil = strip.veil[at] + strip.prefix[at] * suffix_veil
-                    change = g_scale / total * (weight * missing - (weight - one) - others_veil)
+                    others = scratch.opacity_before[at] + scratch.transmittance_before[at] * opacity_behind
+                    change = g_scale / total * (weight * missing - (weight - one) - others)
                     g_a += wp.clamp(change, -limit, limit)
                     g_w -= wp.clamp(g_scale * scale * (a / total), -most, most)
-        g_share += g_a * s.a
-        # share = (rest - next_rest) / before, passed = after / before
-        before = light_to(s, rest)
-        per_before = divide(one, before, zero)
-        g_before = -(g_share * share + g_passed * passed) * per_before
-        g_after = g_passed * per_before
-        g_rest = g_share * per_before
-        g_next_rest = s.a * g_after - g_rest
-        grad = strip.grad[at]
-        grad_a = grad.a + g_a * share + g_after * next_rest
-        grad_t = grad.t + g_after
-        grad_l = grad.l
-        grad_f = grad.f
-        grad_z = grad.z
-        if rest < one:
-            grad_a += g_before * rest
-            grad_t += g_before
-            g_rest += s.a * g_before
-        if strip.r[at] > zero:
-            # This cut also ended the interval before.
-            beta = fragment_beta(pixels, pixel, strip.order[at], beta_per)
-            cut_a, cut_l, cut_f, cut_z, cut_depth, cut_beta = cut_slab_adjoint(
-                g_rest + strip.cut[at], s, strip.r[at], strip.power[at], beta, pixels.floor
-            )
-            grad_a += cut_a
-            grad_l += cut_l
-            grad_f += cut_f
-            grad_z += cut_z
-            g_depth += cut_depth
-            strip.grad_beta[at] = strip.grad_beta[at] + cut_beta
-        grad_c = grad.c + share * weight * scale * g
-        strip.grad[at] = slab(grad_c, grad_a, grad_t, grad_l, grad.w + g_w, grad_f, grad_z)
-        strip.cut[at] = g_next_rest
-        strip.rest[at] = next_rest
-        strip.r[at] = strip.next_r[at]
-        strip.power[at] = strip.next_power[at]
-        suffix_veil = a + passed * suffix_veil
-        suffix *= passed
-    move_boundary(g_depth, sweep.begin_boundary, strip, base)
+        grad = scratch.grad[at]
+        grad.color = grad.color + share * weight * scale * g
+        grad.weight = grad.weight + g_w
+        scratch.grad[at] = grad
+        g_share = projection * weight * scale + g_a * s.opacity
+        beta = fragment_beta(lists, pixel, scratch.order[at], beta_per)
+        g_depth += cut_adjoint(g_share, g_a, g_passed, scratch, at, beta, lists.floor)
+        opacity_behind = a + passed * opacity_behind
+        tau_behind *= passed
+    move_boundary(g_depth, sweep.begin_boundary, scratch, base)
 
 
 @wp.func(inline=True)
-def move_boundary(g: Any, boundary: int, strip: Any, base: int):
+def move_boundary(g: Any, boundary: int, scratch: Any, base: int):
     """Add the gradient of a boundary's depth to that of its fragment."""
     at = base + boundary // 2
-    grad = strip.grad[at]
+    grad = scratch.grad[at]
     if boundary % 2 == 1:
-        grad.z = grad.z + g
+        grad.back = grad.back + g
     else:
-        grad.f = grad.f + g
-    strip.grad[at] = grad
+        grad.front = grad.front + g
+    scratch.grad[at] = grad

@@ -1,0 +1,220 @@
+"""Options that several commands have, and how their words are read: numbers, sizes, colours, NAME=VALUE."""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from warpfrag.errors import range_wording, shorten, suggest
+
+if TYPE_CHECKING:
+    from warpfrag.scene.scene import Scene
+    from warpfrag.scene.surface import SceneObject
+
+_SIZE = re.compile(r"(\d{1,9})\s*[xX×]\s*(\d{1,9})")
+_VERTICES = ".vertices"
+
+SceneArgument = Annotated[
+    str, typer.Argument(metavar="SCENE.toml", help="The scene, or example:NAME.", show_default=False)
+]
+BetaOption = Annotated[
+    str | None, typer.Option("--beta", metavar="NUMBER", help="In-slab interpolation, 0 (optical) to 1 (linear).")
+]
+LayersOption = Annotated[
+    str | None, typer.Option("--layers", metavar="NUMBER", help="Largest number of layers of a pixel.")
+]
+MergeOption = Annotated[str | None, typer.Option("--merge", help="none, smooth, order_independent or exact.")]
+MixOption = Annotated[str | None, typer.Option("--mix", help="opacity, average or optical_depth.")]
+SizeOption = Annotated[str | None, typer.Option("--size", metavar="WxH", help="Width and height in pixels.")]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="NAME=VALUE", help="Any parameter, such as ball.opacity=0.5; may be repeated."),
+]
+ParametersOption = Annotated[
+    Path | None, typer.Option("--parameters", metavar="FILE", help="The result.json of a fit, whose values to take.")
+]
+VerboseOption = Annotated[bool, typer.Option("--verbose", help="Show what Warp finds and compiles.")]
+
+
+class UsageError(ValueError):
+    """An option that cannot be used, in one line."""
+
+
+def read_scene(
+    path: str,
+    parameters: Path | None,
+    settings: Sequence[str] | None,
+    *,
+    beta: str | None = None,
+    layers: str | None = None,
+    merge: str | None = None,
+    mix: str | None = None,
+    size: str | None = None,
+) -> "Scene":
+    """Read a scene and apply the options that change it, later ones over earlier ones.
+
+    Raises:
+        UsageError: an option cannot be used.
+        ValueError: the scene cannot be used, or a value is out of its range.
+    """
+    from warpfrag.files.scene_file import load_scene
+
+    scene = load_scene(path)
+    if parameters is not None:
+        from warpfrag.files.result_file import read_found
+
+        scene = with_values(scene, read_found(parameters, scene.parameter_names()))
+    scene = _with_settings(scene, settings or [])
+    changes: dict[str, Any] = {
+        "beta": None if beta is None else parse_number("--beta", beta, 0.0, 1.0),
+        "layers": None if layers is None else parse_whole("--layers", layers, 1),
+        "merge": merge,
+        "mix": mix,
+        "camera": None if size is None else scene.camera.resized(parse_size(size)),
+    }
+    return replace(scene, **{key: value for key, value in changes.items() if value is not None})
+
+
+def parse_number(option: str, text: str, low: float, high: float) -> float:
+    """Read a number from `low` to `high`."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = float("nan")
+    if not low <= number <= high:
+        raise UsageError(f"{option}: got {_shown(text)}, expected {range_wording(low, high)}")
+    return number
+
+
+def parse_whole(option: str, text: str, low: int) -> int:
+    """Read a whole number of at least `low` that 32 bits hold."""
+    digits = text.strip()
+    if not (digits.isascii() and digits.isdecimal() and len(digits) < 11 and low <= int(digits) < 2**31):
+        raise UsageError(f"{option}: got {_shown(text)}, expected {range_wording(low, whole=True)}")
+    return int(digits)
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """Read width and height such as 640x480."""
+    from warpfrag.files.scene_file import MOST_IMAGE_PIXELS, MOST_PIXELS
+
+    match = _SIZE.fullmatch(text.strip())
+    size = (int(match[1]), int(match[2])) if match else (0, 0)
+    if not (1 <= min(size) <= max(size) <= MOST_PIXELS and size[0] * size[1] <= MOST_IMAGE_PIXELS):
+        limits = f"from 1 to {MOST_PIXELS} each and up to {MOST_IMAGE_PIXELS} pixels in all"
+        raise UsageError(f'--size: got "{text}", expected width and height such as 640x480, {limits}')
+    return size
+
+
+def parse_background(text: str) -> tuple[float, float, float, float]:
+    """Read a background as premultiplied linear RGBA."""
+    from warpfrag.colors import parse_hex
+
+    if text.strip().lower() == "none":
+        return 0.0, 0.0, 0.0, 0.0
+    expected = '"#rrggbb[aa]", "r,g,b[,a]" from 0 to 1, or none'
+    color = list(parse_hex(text) or _numbers("--background", text, (3, 4), expected))
+    if not all(0.0 <= part <= 1.0 for part in color):
+        raise UsageError(f"--background: got {shorten(text)}, expected {expected}")
+    red, green, blue, opacity = [*color, 1.0][:4]
+    return red * opacity, green * opacity, blue * opacity, opacity
+
+
+def parse_thickness(option: str, text: str) -> dict[str, Any]:
+    """Read a z-thickness as the fields of an object that it changes."""
+    from warpfrag.scene.parameters import multiple_of_p
+
+    multiple = multiple_of_p(text)
+    if multiple is not None:
+        return {"thickness": multiple, "thickness_unit": "P"}
+    number = _numbers(option, text, (1,), 'a number, or multiples of P(z) such as "2P"')[0]
+    return {"thickness": number, "thickness_unit": "scene"}
+
+
+def with_values(scene: "Scene", values: Mapping[str, Any]) -> "Scene":
+    """Return a scene with parameters built in; poses last, as a turn is about the middle of what is there."""
+    from warpfrag.scene.names import POSE_KEYS
+    from warpfrag.scene.pose import posed
+
+    objects = []
+    for item in scene.objects:
+        own = {key: values[name] for key in _OBJECT_KEYS if (name := f"{item.name}.{key}") in values}
+        if "thickness" in values:
+            own.setdefault("thickness", values["thickness"])
+        # A value of its own may come with its unit.
+        fields: dict[str, Any] = {}
+        for key, value in own.items():
+            fields.update(value if isinstance(value, dict) else {key: value})
+        objects.append(replace(item, **fields) if fields else item)
+    scene = replace(scene, objects=objects, beta=float(values.get("beta", scene.beta)))
+    poses = {name: value for name, value in values.items() if name.rpartition(".")[2] in POSE_KEYS}
+    return posed(scene, poses) if poses else scene
+
+
+_OBJECT_KEYS = ("thickness", "color", "opacity", "vertices")
+
+
+def _with_settings(scene: "Scene", settings: Sequence[str]) -> "Scene":
+    """Apply `NAME=VALUE`s in order, rotations last: the camera's translation is along its axes in the file."""
+    values: dict[str, Any] = {}
+    for setting in settings:
+        name, text = _split(setting, scene)
+        values[name] = _parse_value(name, text)
+    order = sorted(values, key=lambda name: name.endswith(".rotation"))
+    for name in order:
+        scene = with_values(scene, {name: values[name]})
+    return scene
+
+
+def _split(setting: str, scene: "Scene") -> tuple[str, str]:
+    """Divide NAME=VALUE; a name may have equals signs of its own."""
+    known = [name for name in scene.parameter_names() if not name.endswith(_VERTICES)]
+    if "=" not in setting:
+        raise UsageError(f"--set: got {_shown(setting)}, expected NAME=VALUE")
+    for name in sorted(known, key=len, reverse=True):
+        rest = setting.strip().removeprefix(name).lstrip()
+        if setting.strip().startswith(name) and rest.startswith("="):
+            return name, rest[1:].strip()
+    name = setting.partition("=")[0].strip()
+    raise UsageError(f"--set: got the unknown name {shorten(name)}; {suggest(name, known)}")
+
+
+def _parse_value(name: str, text: str) -> Any:
+    from warpfrag.colors import parse_hex
+    from warpfrag.scene.names import POSE_KEYS
+
+    option, key = f"--set {name}", name.rpartition(".")[2]
+    if key in POSE_KEYS:
+        return _numbers(option, text, (3,), "x,y,z")
+    if key == "thickness":
+        return parse_thickness(option, text)
+    if key == "color":
+        return tuple((parse_hex(text) or _numbers(option, text, (3,), '"#rrggbb" or "r,g,b"'))[:3])
+    return _numbers(option, text, (1,), range_wording(0.0, 1.0))[0]
+
+
+def _numbers(option: str, text: str, counts: Sequence[int], expected: str) -> list[float]:
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in counts:
+        raise UsageError(f"{option}: got {_shown(text)}, expected {expected}")
+    return numbers
+
+
+def _shown(text: str) -> str:
+    """Word what was typed: a number as it stands, anything else in quotes."""
+    try:
+        float(text)
+    except ValueError:
+        return shorten(text)
+    return text.strip()[:60]
+
+
+def with_thickness(item: "SceneObject", text: str) -> "SceneObject":
+    """Return an object with the z-thickness that `--thickness` gives."""
+    return replace(item, **parse_thickness("--thickness", text))

@@ -1,0 +1,65 @@
+"""`warpfrag render`: a scene to an image."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from warpfrag.cli.options import (
+    BetaOption,
+    LayersOption,
+    MergeOption,
+    MixOption,
+    ParametersOption,
+    SceneArgument,
+    SetOption,
+    SizeOption,
+    VerboseOption,
+    parse_background,
+    read_scene,
+    with_thickness,
+)
+from warpfrag.cli.streams import start_warp
+
+
+def render(
+    scene: SceneArgument,
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="A .png, .exr or .npy file.")],
+    beta: BetaOption = None,
+    thickness: Annotated[
+        str | None,
+        typer.Option(metavar="T", help='z-thickness of all objects: scene units, or "2P", multiples of P(z).'),
+    ] = None,
+    layers: LayersOption = None,
+    merge: MergeOption = None,
+    mix: MixOption = None,
+    size: SizeOption = None,
+    bits: Annotated[int, typer.Option(help="Bits per channel of a PNG file, 8 or 16.")] = 8,
+    background: Annotated[
+        str | None, typer.Option(metavar="COLOR", help='"#rrggbb[aa]" (sRGB), "r,g,b[,a]" (linear) or none.')
+    ] = None,
+    parameters: ParametersOption = None,
+    settings: SetOption = None,
+    verbose: VerboseOption = False,
+) -> None:
+    """Render a scene to an image: PNG (sRGB), OpenEXR or .npy (linear, premultiplied) by suffix."""
+    start_warp(verbose)
+    from warpfrag.files.images import check_target, write_image
+    from warpfrag.render import render as render_scene
+
+    check_target(output, bits=bits)
+    wanted = read_scene(scene, parameters, settings, beta=beta, layers=layers, merge=merge, mix=mix, size=size)
+    if thickness is not None:
+        wanted = replace(wanted, objects=[with_thickness(item, thickness) for item in wanted.objects])
+    if background is not None:
+        wanted = replace(wanted, background=parse_background(background))
+    try:
+        image = render_scene(wanted)
+    except (RuntimeError, MemoryError) as error:
+        # Warp says how many bytes it lacks, not what for.
+        if isinstance(error, MemoryError) or "allocate" in str(error):
+            size = " × ".join(map(str, wanted.camera.size))
+            raise MemoryError(f"size: got {size} pixels, expected what fits into memory ({error})") from error
+        raise
+    write_image(output, image, bits=bits)
