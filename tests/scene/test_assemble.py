@@ -233,7 +233,7 @@ def test_values_out_of_range_are_clamped():
         inwards = {1.0: [[0, 3, 3], 3, 0], -1.0: [[-3, -3, -3], 0, -4]}[sign]
         for grad, expected in zip(found, inwards, strict=True):
             np.testing.assert_array_equal(grad, expected)
-    with pytest.raises(ValueError, match="tri.thickness: got inf"):
+    with pytest.raises(ValueError, match=r"tri\.thickness: got inf"):
         assemble(two_objects(), {"tri.thickness": torch.tensor(np.inf)})
 
 
