@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from gltf_files import write_gltf
 from PIL import Image
 
 from warpfrag.errors import SceneError
@@ -244,3 +245,34 @@ def test_paths_below_and_through_the_folder_are_fine(tmp_path):
     os.symlink(tmp_path / "real", tmp_path / "alias")
     for text in ("sub/tri.obj", "sub/../sub/tri.obj"):
         assert objects(tmp_path / "alias", f'[[object]]\nmesh = "{text}"\n')[0].name == "tri"
+
+
+def two_nodes(folder, **names):
+    """Write a glTF of two triangles under two nodes, one above the other."""
+    face = np.array([0, 1, 2], "u2")
+    nodes = [{"mesh": 0, "name": "box"}, {"mesh": 0, "name": "lid", "translation": [0, 0, 1]}]
+    primitive = {"attributes": {"POSITION": 0}, "indices": 1}
+    triangle = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "f4")
+    return write_gltf(folder, [triangle, face], primitive, nodes=nodes, scenes=[{"nodes": [0, 1]}], **names)
+
+
+def test_nodes_are_objects_of_their_own(tmp_path):
+    """With `split` each node is an object with its name, and may have a thickness of its own."""
+    two_nodes(tmp_path)
+    keys = '[[object]]\nmesh = "a.gltf"\nsplit = "nodes"\ntranslate = [5, 0, 0]\n'
+    box, lid = objects(tmp_path, keys + 'thickness = { box = 0.25, lid = "3P" }\n')
+    assert (box.name, box.thickness, box.thickness_unit) == ("box", 0.25, "scene")
+    assert (lid.name, lid.thickness, lid.thickness_unit) == ("lid", 3.0, "P")
+    np.testing.assert_allclose(lid.world_vertices()[0], [5, 0, 1])
+    assert [item.name for item in objects(tmp_path, keys + 'name = "case"\n')] == ["case.box", "case.lid"]
+    with pytest.raises(SceneError, match=r'thickness.lit: got an unknown name, .*did you mean "lid"'):
+        objects(tmp_path, keys + "thickness = { lit = 1 }\n")
+    (whole,) = objects(tmp_path, '[[object]]\nmesh = "a.gltf"\n')
+    assert (whole.name, len(whole.faces)) == ("a", 2)
+
+
+def test_groups_are_objects_of_their_own(tmp_path):
+    """Groups of an obj file likewise; what has no name has that of the file."""
+    write(tmp_path, "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\ng left\nf 1 2 3\ng right\nf 3 2 1\n", "tri.obj")
+    items = objects(tmp_path, '[[object]]\nmesh = "tri.obj"\nsplit = "groups"\nthickness = 0.5\n')
+    assert [(item.name, item.thickness) for item in items] == [("tri", 0.5), ("left", 0.5), ("right", 0.5)]

@@ -27,9 +27,11 @@ def cut_polygons(points: np.ndarray, counts: np.ndarray, corners: np.ndarray) ->
     if len(corners) and not (corners.min() >= 0 and corners.max() < len(points)):
         wrong = corners.min() if corners.min() < 0 else corners.max()
         raise ValueError(f"a face names vertex {wrong}, there are {len(points)}")
+    if (counts == 3).all():
+        return np.arange(len(counts)), np.arange(3 * len(counts)).reshape(-1, 3)
     first = np.cumsum(counts) - counts
     polygon, places = _fans(counts, first)
-    if not len(counts) or counts.max() <= 3:
+    if counts.max() <= 3:
         return polygon, places
     reflex = _reflex_corners(points, counts, first, corners)
     concave = np.unique(np.repeat(np.arange(len(counts)), counts)[reflex])
