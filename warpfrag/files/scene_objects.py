@@ -29,12 +29,11 @@ from warpfrag.files.placement import PLACEMENT_KEYS, read_matrix
 from warpfrag.files.points import load_points
 from warpfrag.files.source import resolved
 from warpfrag.files.table import LARGEST, Table, is_numbers
-from warpfrag.scene.camera import Camera
 from warpfrag.scene.names import CAMERA
 from warpfrag.scene.parameters import multiple_of_p
 from warpfrag.scene.surface import SceneObject
 from warpfrag.shapes import primitives
-from warpfrag.shapes.mesh import GREY, Mesh, lambert, smooth_normals, split_faces, transformed_normals
+from warpfrag.shapes.mesh import GREY, Mesh, smooth_normals, split_faces
 from warpfrag.shapes.surfels import surfels
 
 _OBJECT = ("name", *PLACEMENT_KEYS, "color", "opacity", "thickness", "texture", "normals")
@@ -59,21 +58,17 @@ _DISC_SEGMENTS = 64
 
 @dataclass
 class _Reading:
-    """What the objects of one scene file have in common: the file, its camera and light, meshes read already."""
+    """What the objects of one scene file have in common: the file, meshes read already."""
 
     file: Path
-    camera: Camera
-    light: Table | None
     meshes: dict[tuple, list[Mesh]] = field(default_factory=dict)
 
 
-def read_objects(top: Table, camera: Camera, light: Table | None) -> list[SceneObject]:
+def read_objects(top: Table) -> list[SceneObject]:
     """Read all objects of a scene file, in its order.
 
     Args:
         top: the table of the whole file.
-        camera: from whose eye light comes that has no direction.
-        light: the table `[light]`; None leaves all unlit.
 
     Raises:
         SceneError: a key, or a file that it names, cannot be used.
@@ -83,7 +78,7 @@ def read_objects(top: Table, camera: Camera, light: Table | None) -> list[SceneO
     if not isinstance(entries, list) or not entries:
         got = "none" if not entries else "one table"
         raise top.error("object", got, "one or more tables headed [[object]]")
-    reading = _Reading(Path(top.file), camera, light)
+    reading = _Reading(Path(top.file))
     objects: list[SceneObject] = []
     owner: dict[str, int] = {}
     for index, entry in enumerate(entries):
@@ -170,7 +165,7 @@ def _scene_object(table: Table, name: str, mesh: Mesh, reading: _Reading, thickn
     thickness, unit = _thickness(table, default if thickness_value is None else thickness_value)
     color = np.full(3, 1.0 if mesh.textures else GREY) if mesh.color is None else mesh.color
     try:
-        item = SceneObject(
+        return SceneObject(
             name,
             mesh.vertices,
             mesh.faces,
@@ -182,12 +177,10 @@ def _scene_object(table: Table, name: str, mesh: Mesh, reading: _Reading, thickn
             mesh.uv if mesh.textures else None,
             (mesh.textures if mesh.texture_index is not None else mesh.textures[0]) if mesh.textures else None,
             mesh.texture_index if mesh.textures else None,
+            normals=mesh.normals,
         )
     except ValueError as error:
         raise table.prefixed("", error) from None
-    if reading.light is not None:
-        item.shade = _shade(reading.light, reading.camera, item, mesh)
-    return item
 
 
 def _meshes(table: Table, reading: _Reading) -> tuple[str, list[Mesh]]:
@@ -298,18 +291,3 @@ def _thickness(table: Table, value: Any) -> tuple[float, Any]:
     if value > LARGEST:
         raise table.error("thickness", shorten(value), range_wording(0.0, LARGEST))
     return float(value), "scene"
-
-
-def _shade(light: Table, camera: Camera, item: SceneObject, mesh: Mesh) -> np.ndarray:
-    direction = light.data.get("direction", "camera")
-    ambient = light.number("ambient", 0.0, 1.0)
-    if direction != "camera" and (not is_numbers(direction, 3) or not any(direction)):
-        raise light.error("direction", shorten(direction), '3 numbers that are not all 0, or "camera"')
-    if direction != "camera":
-        towards = np.array(direction, dtype=np.float64)
-    elif camera.is_perspective:
-        towards = np.asarray(camera.eye) - item.world_vertices()
-    else:
-        towards = np.subtract(camera.eye, camera.target)
-    assert mesh.normals is not None
-    return lambert(transformed_normals(mesh.normals, item.matrix), towards, 0.3 if ambient is None else ambient)

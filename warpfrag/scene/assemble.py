@@ -2,8 +2,8 @@
 
 Differentiable, with torch overrides: world vertices in `"<name>.vertices"`, `"<name>.translation"` and
 `"<name>.rotation"`, colour, opacity and thickness in theirs. Frozen: faces, transforms, the point about which an object
-turns, textures and baked factors of the colours. What captures the geometry holds coverage fixed as well: a gradient in
-vertices or poses moves depths and attributes inside outlines, not the outlines.
+turns, textures and the factors of light (see `light`). What captures the geometry holds coverage fixed as well: a
+gradient in vertices or poses moves depths and attributes inside outlines, not the outlines.
 
 Coordinates are computed in float64 from the object's own vertices, its matrix and its pose, component by component:
 NumPy and torch round alike, and no matrix product is left to what autocast makes of it.
@@ -18,6 +18,7 @@ import numpy as np
 from warpfrag.arrays.kinds import NUMPY, Kind, dtype_name, kind_of
 from warpfrag.errors import check_choice, shorten
 from warpfrag.scene.camera import Camera
+from warpfrag.scene.light import transformed_normals, turned_normals
 from warpfrag.scene.names import CAMERA, POSE_KEYS
 from warpfrag.scene.parameters import (
     BOUNDS,
@@ -31,6 +32,7 @@ from warpfrag.scene.parameters import (
     check_name,
 )
 from warpfrag.scene.pose import move_object
+from warpfrag.scene.rotation import rotation_matrix
 from warpfrag.scene.scene import Scene
 from warpfrag.scene.surface import SceneObject
 
@@ -44,7 +46,7 @@ class Geometry:
     Attributes:
         vertices: world space [scene units], (V, 3) float64, whatever the precision of the image.
         faces: indices into `vertices`, (N, 3) int32 NumPy; objects one after the other, in submission order.
-        rgba: straight colour (shade included) and opacity, without textures, (V, 4).
+        rgba: straight colour (shade and light included) and opacity, without textures, (V, 4).
         thickness: z-thickness (V,), in scene units or multiples of P(z) as `thickness_in_p` says; 0 where there is a
             map.
         object_id: object of each face, (N,) int32 NumPy.
@@ -178,13 +180,22 @@ def assemble(
     first_vertex = 0
     textured = any(item.texture is not None for item in scene.objects)
     xp = frame.kind.xp
+    camera_pose = _pose(CAMERA, overrides, known, frame)
+    # The camera as light goes with it.
+    eye = camera if camera_pose is None else camera.moved(*(frame.kind.to_numpy(value) for value in camera_pose))
     for index, item in enumerate(scene.objects):
         values = _values(item, overrides, known, frame, camera, bounds)
         count = len(item.vertices)
-        vertices.append(world_vertices_of(values[VERTICES], item, _pose(item.name, overrides, known, frame), frame))
+        pose = _pose(item.name, overrides, known, frame)
+        vertices.append(world_vertices_of(values[VERTICES], item, pose, frame))
         color = xp.broadcast_to(values[COLOR], (count, 3))
         if item.shade is not None:
             color = color * frame.array(item.shade)[:, None]
+        if scene.light is not None and item.normals is not None:
+            own = values[VERTICES] if f"{item.name}.{VERTICES.key}" in overrides else None
+            normals = world_normals_of(item, own, pose, frame)
+            points = frame.kind.to_numpy(vertices[-1])
+            color = color * frame.array(scene.light.factor(normals, points, eye))[:, None]
         opacity = xp.broadcast_to(values[OPACITY], (count,))
         rgba.append(xp.concatenate([color, opacity[:, None]], 1))
         if len(values[THICKNESS].shape) == 2:
@@ -211,7 +222,7 @@ def assemble(
         thickness_maps=thickness_maps,
         thickness_in_p=np.array([item.thickness_unit == "P" for item in scene.objects], dtype=bool),
         precision=frame.precision,
-        camera_pose=_pose(CAMERA, overrides, known, frame),
+        camera_pose=camera_pose,
     )
 
 
@@ -229,6 +240,23 @@ def world_vertices_of(own: Any, item: SceneObject, pose: tuple[Any, Any] | None,
     rows = [[float(value) for value in row] for row in item.matrix[:3]]
     points = [row[0] * x + row[1] * y + row[2] * z + row[3] for row in rows]
     return frame.kind.xp.stack(points if pose is None else move_object(points, item.middle(), *pose), 1)
+
+
+def world_normals_of(item: SceneObject, own: Any, pose: tuple[Any, Any] | None, frame: Frame) -> np.ndarray:
+    """Return an object's normals in world space, of any length, (V, 3) float64 NumPy, without gradient.
+
+    Args:
+        item: the object, which has normals.
+        own: vertices in the place of its own, (V, 3); None for its own.
+        pose: its translation and rotation vector; None where it stays.
+        frame: the kind of all of them.
+    """
+    assert item.normals is not None
+    normals = item.normals
+    if own is not None:
+        normals = turned_normals(normals, item.faces, item.vertices, frame.kind.to_numpy(own))
+    normals = transformed_normals(normals, item.matrix)
+    return normals if pose is None else normals @ rotation_matrix(frame.kind.to_numpy(pose[1])).T
 
 
 def _values(
