@@ -76,7 +76,7 @@ def test_arguments_are_checked():
     for near, far in ((0.0, 1.0), (2.0, 1.0), (1.0, float("inf")), (float("nan"), 1.0)):
         with pytest.raises(ValueError, match=r"(near|far): got"):
             z_resolution(1.0, near, far)
-    with pytest.raises(TypeError, match='near: got "0.1", expected a number above 0'):
+    with pytest.raises(TypeError, match=r'near: got "0\.1", expected a number above 0'):
         z_resolution(1.0, "0.1", 1.0)
     with pytest.raises(ValueError, match="bits: got 0, expected a whole number from 1 to 64"):
         z_resolution(1.0, 0.1, 1.0, 0)

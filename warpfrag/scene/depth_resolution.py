@@ -83,7 +83,10 @@ def z_resolution_fwd(number: Any) -> Any:
         Args:
             span: the depths.
             depth: [scene units], (n,).
-            near: see `DepthBuffer`, as far, step and perspective.
+            near: see `DepthBuffer`, as the three that follow.
+            far: [scene units].
+            step: of 1.
+            perspective: 1 or 0.
             resolution: output, P [scene units], (n,).
         """
         for item in range(span.begin + wp.tid(), span.end, span.stride):
@@ -111,7 +114,10 @@ def z_resolution_bwd(number: Any) -> Any:
         Args:
             span: the depths.
             depth: [scene units], (n,).
-            near: see `DepthBuffer`, as far, step and perspective.
+            near: see `DepthBuffer`, as the three that follow.
+            far: [scene units].
+            step: of 1.
+            perspective: 1 or 0.
             grad_resolution: gradient in P, (n,).
             grad_depth: output, gradient in the depth, (n,).
         """
