@@ -3,7 +3,8 @@
 import numpy as np
 
 from warpfrag.scene.camera import Camera
-from warpfrag.scene.scene import Scene, SceneObject
+from warpfrag.scene.scene import Scene
+from warpfrag.scene.surface import SceneObject
 
 AHEAD = {"eye": (0.0, 0.0, 0.0), "target": (0.0, 0.0, 1.0), "up": (0.0, -1.0, 0.0)}
 """A camera whose space is world space."""

@@ -3,7 +3,8 @@
 import numpy as np
 
 from warpfrag.scene.camera import Camera
-from warpfrag.scene.scene import Scene, SceneObject
+from warpfrag.scene.scene import Scene
+from warpfrag.scene.surface import SceneObject
 from warpfrag.shapes.primitives import sphere
 
 COLORS = ((0.9, 0.1, 0.1), (0.1, 0.8, 0.2), (0.1, 0.2, 0.9))

@@ -17,7 +17,8 @@ from warpfrag.fit import FitParameter, Reference, Study, fit  # noqa: E402
 from warpfrag.fit.jacobian import Evaluation  # noqa: E402
 from warpfrag.fit.problem import Problem  # noqa: E402
 from warpfrag.scene.camera import Camera  # noqa: E402
-from warpfrag.scene.scene import Scene, SceneObject  # noqa: E402
+from warpfrag.scene.scene import Scene  # noqa: E402
+from warpfrag.scene.surface import SceneObject  # noqa: E402
 from warpfrag.shapes.primitives import sphere  # noqa: E402
 
 
@@ -58,7 +59,7 @@ def main() -> None:
     for words, method, parameters in cases:
         study = Study(scene, Reference(true={}), parameters, method=method, steps=arguments.steps, tolerance=0.0)
         rate = jacobians(study, arguments.steps) if method == "least_squares" else steps(study)
-        rows.append((words, method, str(sum(np.size(v.start) for v in study.variables)), f"{rate:.1f}"))
+        rows.append((words, method, str(sum(np.size(v.start) for v in study.prepared.parameters)), f"{rate:.1f}"))
     count = wf.capture(scene).count
     title = f"{arguments.size}², {count / 1e6:.2f} M fragments, {arguments.threads} threads"
     show(title, ("fitted", "method", "numbers", "iterations / s"), rows)
@@ -66,7 +67,7 @@ def main() -> None:
 
 def jacobians(study: Study, repetitions: int) -> float:
     """Return images with Jacobian per second."""
-    problem, loss = Problem(study), study.image_loss.robust
+    problem, loss = Problem(study), study.prepared.image_loss.robust
     evaluate = partial(Evaluation, problem, loss)
     evaluate(problem.start()).compress()
     begin = time.perf_counter()
@@ -79,7 +80,7 @@ def steps(study: Study) -> float:
     """Return images with gradient per second, from the times at which steps are reported."""
     times: list[float] = []
     result = fit(study, progress=lambda progress: times.append(time.perf_counter()))
-    images = (result.evaluations - 1) if study.method == "lbfgs" else len(times) - 1
+    images = (result.evaluations - 1) if study.prepared.method == "lbfgs" else len(times) - 1
     return images / (times[-1] - times[0])
 
 

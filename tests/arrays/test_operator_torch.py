@@ -327,3 +327,58 @@ def test_float32_stays_float32(device):
         assert image.dtype == torch.float32
         (gradient,) = torch.autograd.grad(image.sum(), fragments.rgba)
         assert gradient.dtype == torch.float32
+
+
+# torch.func.
+
+
+def test_transforms_are_those_of_autograd():
+    """`grad`, `jacrev` and `vmap` agree with backward and with a loop."""
+    fragments = leaves()
+    rgba = fragments.rgba.detach()
+
+    def image(rgba):
+        return wf.composite(rebuild(fragments, [rgba, *(t.detach() for t in floats(fragments)[1:])]), 0.4)
+
+    expected = torch.autograd.functional.jacobian(image, rgba)
+    torch.testing.assert_close(torch.func.jacrev(image)(rgba), expected, rtol=0.0, atol=0.0)
+    total = torch.func.grad(lambda rgba: image(rgba).sum())(rgba)
+    torch.testing.assert_close(total, expected.sum((0, 1, 2)), rtol=1e-13, atol=1e-13)
+    batch = torch.stack([rgba, 0.5 * rgba])
+    torch.testing.assert_close(torch.func.vmap(image)(batch), torch.stack([image(one) for one in batch]))
+
+
+def test_transforms_of_several_outputs():
+    """Layers have outputs of several types; a count has no gradient."""
+    fragments = leaves()
+    rest = [t.detach() for t in floats(fragments)[1:]]
+
+    def depths(rgba):
+        return wf.resolve(rebuild(fragments, [rgba, *rest]), max_layers=2).rgba
+
+    rgba = fragments.rgba.detach()
+    expected = torch.autograd.functional.jacobian(depths, rgba)
+    torch.testing.assert_close(torch.func.jacrev(depths)(rgba), expected, rtol=0.0, atol=0.0)
+
+
+@pytest.mark.parametrize("transform", ["jvp", "jacfwd", "hessian", "dual"])
+def test_forward_mode_is_refused(transform):
+    """In our words, instead of a derivative of zero."""
+    fragments = leaves()
+    rgba = fragments.rgba.detach()
+
+    def total(rgba):
+        return wf.composite(rebuild(fragments, [rgba, *(t.detach() for t in floats(fragments)[1:])])).sum()
+
+    def dual(rgba):
+        with torch.autograd.forward_ad.dual_level():
+            total(torch.autograd.forward_ad.make_dual(rgba, torch.ones_like(rgba)))
+
+    calls = {
+        "jvp": lambda: torch.func.jvp(total, (rgba,), (torch.ones_like(rgba),)),
+        "jacfwd": lambda: torch.func.jacfwd(total)(rgba),
+        "hessian": lambda: torch.func.hessian(total)(rgba),
+        "dual": lambda: dual(rgba),
+    }
+    with pytest.raises(NotImplementedError, match=r"warpfrag\.composite: got a forward-mode derivative"):
+        calls[transform]()

@@ -274,7 +274,7 @@ def test_arguments_are_checked():
     with pytest.raises(ValueError, match="unknown name"):
         Coverage.of(setting, parameters={"soup.rotations": 0.0})
     coverage = Coverage.of(setting)
-    with pytest.raises(ValueError, match=r"soup.translation: found shape \(2,\), expected shape \(3,\)"):
+    with pytest.raises(ValueError, match=r"soup.translation: got shape \(2,\), expected shape \(3,\)"):
         coverage.shade({"soup.translation": (0.0, 1.0)})
     with pytest.raises(ValueError, match=r"grad_depth: got shape \(3,\), expected \("):
         coverage.motion_gradients(None, None, np.zeros(3), None)

@@ -283,17 +283,17 @@ def test_fit_all_runs_every_study(folder, capsys):
     assert told == [
         "warpfrag: failing: ValueError: found 3, expected 4 (more in results/fit/failing/log.txt)",
         "warpfrag: killed: study.py was ended by SIGKILL (more in results/fit/killed/log.txt)",
-        "warpfrag: silent: found no new results/fit/silent/summary.json, expected study.py to save a Summary"
+        "warpfrag: silent: got no new results/fit/silent/summary.json, expected study.py to save a Summary"
         " (more in results/fit/silent/log.txt)",
     ]
     assert (folder / "results" / "fit" / "good" / "log.txt").read_text() == "measuring\n"
     assert "It is 1.5." in (studies / "good" / "README.md").read_text()
     text = (folder / "results" / "fit" / "report.html").read_text()
-    assert re.findall(r"ValueError: found 3, expected 4|ended by SIGKILL|found no new results|It is 1.5", text) == [
+    assert re.findall(r"ValueError: found 3, expected 4|ended by SIGKILL|got no new results|It is 1.5", text) == [
         "ValueError: found 3, expected 4",
         "It is 1.5",
         "ended by SIGKILL",
-        "found no new results",
+        "got no new results",
         "It is 1.5",
     ]
 
@@ -319,7 +319,7 @@ def test_old_summary_does_not_count(folder, capsys):
     assert main(["fit", "brief"]) == 0
     (folder / "brief" / "study.py").write_text("")
     assert main(["fit", "brief"]) == 1
-    assert "found no new" in capsys.readouterr().err
+    assert "got no new" in capsys.readouterr().err
 
 
 def test_module_is_the_command_line(folder):

@@ -11,12 +11,14 @@ from small_scene import spheres
 from warpfrag.files.images import read_image, write_image
 from warpfrag.fit import FitError, FitParameter, FitResult, Reference, Study, StudyError, fit
 from warpfrag.fit import problem as problem_module
-from warpfrag.fit.jacobian import Evaluation, _triangle
+from warpfrag.fit.compression import triangle_of
+from warpfrag.fit.jacobian import Evaluation
 from warpfrag.fit.losses import RobustLoss
 from warpfrag.fit.problem import Problem, ViewProblem
+from warpfrag.fit.saving import to_json
 from warpfrag.fit.session import fingerprint
 from warpfrag.render import render
-from warpfrag.scene.scene import SceneObject
+from warpfrag.scene.surface import SceneObject
 from warpfrag.shapes.primitives import plane
 
 STARTS = {"beta": 0.9, "red.thickness": 0.8, "green.thickness": 0.12, "blue.thickness": 0.6}
@@ -37,7 +39,7 @@ def test_frozen_geometry_renders_the_same_image(background):
     whole = render(problem.views[0].scene, parameters={name: np.float32(value) for name, value in values.items()})
     view = problem.views[0]
     np.testing.assert_allclose(view.image(values), whole, atol=0.0)
-    scaled = view.unit.scaled(*view.unit.scales(view.parameters(values)))
+    scaled = view.unit.scaled(view.unit.scales(view.parameters(values)))
     image = view.over_background(view.composite(scaled, np.float32(0.4)))
     np.testing.assert_allclose(image, whole, atol=2e-6)
 
@@ -174,7 +176,7 @@ def test_parameters_out_of_sight_are_named():
     assert result.standard_errors["green.opacity"] == np.inf
     assert result.found["green.opacity"] == pytest.approx(0.3)
     assert result.found["red.opacity"] == pytest.approx(0.6, rel=1e-3)
-    content = json.loads(json.dumps(result.to_json(), allow_nan=False))
+    content = json.loads(json.dumps(to_json(result), allow_nan=False))
     assert content["standard_errors"]["green.opacity"] is None
     assert content["condition_number"] is None
 
@@ -360,7 +362,7 @@ def test_triangle_takes_all_rows():
     generator = np.random.default_rng(7)
     for count in (3, 500, 1300):
         rows = generator.normal(size=(count, 5))
-        triangle = _triangle([rows[: count // 2], rows[count // 2 :]])
+        triangle = triangle_of([rows[: count // 2], rows[count // 2 :]])
         assert triangle.shape == (5, 5)
         np.testing.assert_allclose(triangle.T @ triangle, rows.T @ rows, rtol=1e-10, atol=1e-10)
 
@@ -434,7 +436,7 @@ def test_reference_from_a_file(tmp_path):
         study = Study(scene, Reference(image=read_image(tmp_path / name)), STARTS)
         found = fit(study).found
         assert found["beta"] == pytest.approx(0.5, rel=0.01)
-    with pytest.raises(StudyError, match="found 40 × 36 pixels, expected 20 × 18"):
+    with pytest.raises(StudyError, match="got 40 × 36 pixels, expected 20 × 18"):
         fit(study.resized((20, 18)))
 
 

@@ -66,9 +66,9 @@ def test_descent_takes_values_by_vertex():
 
 def test_what_does_not_go_together_is_refused():
     """Merging by depth, other mixes and beta have no place in a k-buffer."""
-    with pytest.raises(StudyError, match='merge: found "smooth" with resolve "kbuffer"'):
+    with pytest.raises(StudyError, match='merge: got "smooth" with resolve "kbuffer"'):
         make_study(merge="smooth")
-    with pytest.raises(StudyError, match='parameters: found beta with resolve "kbuffer"'):
+    with pytest.raises(StudyError, match='parameters: got beta with resolve "kbuffer"'):
         make_study({"beta": 0.5})
-    with pytest.raises(StudyError, match="resolve: found"):
+    with pytest.raises(StudyError, match="resolve: got"):
         Study(spheres(), Reference(true={}), START, resolve="bins")

@@ -12,6 +12,7 @@ from warpfrag.fit import FitError, FitParameter, FitResult, Reference, Study, St
 from warpfrag.fit.descent import Adam
 from warpfrag.fit.maps import Smoothness, coarsen, level_of, refine
 from warpfrag.fit.problem import Problem
+from warpfrag.fit.saving import to_json
 from warpfrag.fit.session import Session
 
 
@@ -23,7 +24,7 @@ def make_study(parameters, *, true=None, scene=None, **options) -> Study:
 def smoothness(name: str, parameter: FitParameter) -> Smoothness:
     """Return the prior on a parameter of the small scene."""
     study = make_study({name: parameter}, method="adam")
-    return Smoothness(study.variables[0], study.scene, "cpu")
+    return Smoothness(study.prepared.parameters[0], study.scene, "cpu")
 
 
 def test_grids_go_there_and_back():
@@ -45,7 +46,7 @@ def test_grids_go_there_and_back():
 
 def test_levels_go_down_by_stages():
     """The coarsest first, the finest from then on."""
-    variable = make_study({"beta": FitParameter(per="pixel", levels=3)}).variables[0]
+    variable = make_study({"beta": FitParameter(per="pixel", levels=3)}).prepared.parameters[0]
     assert [level_of(variable, stage) for stage in range(5)] == [2, 1, 0, 0, 0]
 
 
@@ -134,7 +135,7 @@ def test_thickness_of_all_objects():
     scene = spheres()
     true = {"thickness": 0.3, "green.thickness": 0.5}
     study = make_study({"thickness": 0.7, "green.thickness": 0.2, "beta": 0.9}, scene=scene, true=true)
-    assert study.method == "least_squares"
+    assert study.prepared.method == "least_squares"
     result = fit(study)
     assert max(result.relative_errors().values()) < 0.01
 
@@ -144,18 +145,18 @@ def test_thickness_in_multiples_of_p():
     scene = spheres()
     study = make_study({"red.thickness": FitParameter("200000P")}, scene=scene)
     assert study.scene.objects[0].thickness_unit == "scene"
-    assert study.fitted_scene.objects[0].thickness_unit == "P"
-    assert study.true is None
+    assert study.prepared.scene.objects[0].thickness_unit == "P"
+    assert study.prepared.true is None
     result = fit(study)
     # P(z) varies by a few percent over the sphere, so that one multiple cannot be one length.
     middle = float(np.linalg.norm(np.subtract(scene.camera.eye, scene.objects[0].middle())))
     length = result.found["red.thickness"] * float(wf.z_resolution(middle, 0.1, 10.0))
     assert length == pytest.approx(0.3, rel=0.25)
     known = replace(study, reference=Reference(true={"red.thickness": "300000P"}))
-    assert known.true["red.thickness"] == 3e5
+    assert known.prepared.true["red.thickness"] == 3e5
     assert fit(known).found["red.thickness"] == pytest.approx(3e5, rel=0.01)
     for name, start in (("beta", "2P"), ("red.thickness", "much")):
-        with pytest.raises(StudyError, match=f"{name}: found"):
+        with pytest.raises(StudyError, match=f"{name}: got"):
             make_study({name: FitParameter(start)})
 
 
@@ -196,7 +197,7 @@ def test_all_restarts_are_reported(method):
     assert first.runs[1].start["beta"] != first.runs[2].start["beta"]
     assert first.loss == min(run.loss for run in first.runs)
     assert first.found == next(run.found for run in first.runs if run.loss == first.loss)
-    assert first.to_json()["runs"][2]["loss"] == first.runs[2].loss
+    assert to_json(first)["runs"][2]["loss"] == first.runs[2].loss
     assert any("3 starts" in line for line in first.lines())
 
 
@@ -232,7 +233,7 @@ def test_patience_stops_early():
 def test_structural_similarity_is_fitted():
     """Colours come back by SSIM and absolute values together, over several scales."""
     study = make_study({"red.color": [0.5, 0.5, 0.5]}, loss={"l1": 0.8, "ssim": 0.2}, scales=2, steps=200)
-    assert study.method == "adam"
+    assert study.prepared.method == "adam"
     result = fit(study)
     np.testing.assert_allclose(result.found["red.color"], (0.9, 0.1, 0.1), atol=0.02)
     assert result.setting["loss_name"] == "0.8 l1 + 0.2 ssim"

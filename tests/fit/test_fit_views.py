@@ -86,12 +86,12 @@ def test_multi_scale_jacobian_is_that_of_the_pyramid():
     """With scales the cost is the mean over levels, and Jᵀf its gradient as torch has it."""
     study = make_study({"beta": 0.4, "red.thickness": 0.5, "blue.opacity": 0.5}, scales=3, loss="huber", delta=0.05)
     problem = Problem(study)
-    evaluation = Evaluation(problem, study.image_loss.robust, problem.start())
+    evaluation = Evaluation(problem, study.prepared.image_loss.robust, problem.start())
     compressed = evaluation.compress()
     leaves = {n: torch.tensor(v, requires_grad=True) for n, v in problem.values(problem.start()).items()}
     loss = sum(view.loss(view.image(leaves)) for view in problem.views) / 3
     loss.backward()
-    factor = study.image_loss.robust.factor
+    factor = study.prepared.image_loss.robust.factor
     np.testing.assert_allclose(evaluation.cost * factor, float(loss.detach()), rtol=1e-6)
     gradient = 2.0 * factor * np.sqrt(compressed.cost) * compressed.jacobian[0]
     values = problem.values(problem.start())
@@ -128,7 +128,7 @@ def test_motion_columns_are_autograd(name, per_vertex, opacity):
     problem = Problem(make_study(parameters, scene=scene, count=1))
     view, start = problem.views[0], problem.start()
     evaluation = Evaluation(problem, RobustLoss.named("l2", 1.0), start).views[0]
-    variables = problem.study.variables
+    variables = problem.study.parameters
     first = sum(v.start.size for v in variables[: [v.name for v in variables].index(name)])
     generator = np.random.default_rng(2)
     for channel in range(4):
@@ -250,7 +250,7 @@ def test_a_wish_to_stop_is_one_in_all_processes(tmp_path):
 
 def test_held_out_views_share_the_references_values():
     """True values stacked by view say nothing of a view that is held out."""
-    with pytest.raises(StudyError, match=r"reference\.true\.camera\.rotation: found one value per view"):
+    with pytest.raises(StudyError, match=r"reference\.true\.camera\.rotation: got one value per view"):
         make_study({"beta": 0.5}, true={"camera.rotation": np.ones((2, 3))}, held_out=1)
 
 
@@ -315,7 +315,7 @@ def test_views_from_a_file(tmp_path):
     assert study.views[1].camera.size == (16, 12)
     broken = STUDY.format(batch=2).replace('name = "left"', 'name = "front"')
     (tmp_path / "study.toml").write_text(broken)
-    with pytest.raises(StudyError, match='found the name "front" more than once'):
+    with pytest.raises(StudyError, match='got the name "front" more than once'):
         load_study(tmp_path / "study.toml")
 
 

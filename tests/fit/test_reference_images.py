@@ -77,7 +77,7 @@ def refused(folder, image: str, background: str = OPAQUE) -> str:
     message, path = str(caught.value).removeprefix(f"{folder / 'study.toml'}: "), str(folder / image)
     assert "\n" not in message
     assert message.startswith(f"{path}: ")
-    return message.removeprefix(f"{path}: ")
+    return message.removeprefix(f"{path}: ").replace("found ", "got ", 1)
 
 
 def save(folder, stored: np.ndarray, mode: str | None = None, **options) -> str:
@@ -233,26 +233,26 @@ def test_wrong_size_is_refused(folder, name):
     """Width and height of the camera are told, also when only swapped."""
     for shape, found in (((3, 2, 4), "2 × 3"), ((4, 6, 3), "6 × 4")):
         write_image(folder / name, np.zeros(shape))
-        assert refused(folder, name) == f"found {found} pixels, expected 3 × 2 like the study's camera"
+        assert refused(folder, name) == f"got {found} pixels, expected 3 × 2 like the study's camera"
 
 
 def test_files_that_are_no_images(folder):
     """Missing, empty, a folder, another kind of file, or one that only bears the name."""
-    assert refused(folder, "none.png") == "found no such file, expected an image"
+    assert refused(folder, "none.png") == "got no such file, expected an image"
     (folder / "folder.png").mkdir()
-    assert refused(folder, "folder.png") == "found a folder, expected an image"
+    assert refused(folder, "folder.png") == "got a folder, expected an image"
     (folder / "empty.png").write_bytes(b"")
-    assert refused(folder, "empty.png") == "found what is not a PNG file, expected one"
+    assert refused(folder, "empty.png") == "got what is not a PNG file, expected one"
     jpeg = io.BytesIO()
     Image.fromarray(RGB).save(jpeg, "JPEG")
     (folder / "photo.png").write_bytes(jpeg.getvalue())
-    assert refused(folder, "photo.png") == "found what is not a PNG file, expected one"
+    assert refused(folder, "photo.png") == "got what is not a PNG file, expected one"
     (folder / "photo.jpg").write_bytes(jpeg.getvalue())
-    assert refused(folder, "photo.jpg") == "found the suffix .jpg, expected one of .png, .exr, .npy"
-    assert refused(folder, "photo") == "found no suffix, expected one of .png, .exr, .npy"
+    assert refused(folder, "photo.jpg") == "got the suffix .jpg, expected one of .png, .exr, .npy"
+    assert refused(folder, "photo") == "got no suffix, expected one of .png, .exr, .npy"
     for name in ("empty.exr", "empty.npy"):
         (folder / name).write_bytes(b"")
-        assert refused(folder, name).startswith("found a file that cannot be read")
+        assert refused(folder, name).startswith("got a file that cannot be read")
 
 
 @pytest.mark.parametrize("kind", ["8 bit", "16 bit"])
@@ -262,7 +262,7 @@ def test_truncated_png_is_refused(folder, kind):
     whole = (folder / "a.png").read_bytes()
     for length in range(0, len(whole) - 4, 3):
         (folder / "a.png").write_bytes(whole[:length])
-        assert "found" in refused(folder, "a.png")
+        assert "got" in refused(folder, "a.png")
 
 
 @pytest.mark.parametrize("kind", ["8 bit", "16 bit"])
@@ -274,7 +274,7 @@ def test_damaged_png_is_refused(folder, kind):
         damaged = bytearray(whole)
         damaged[place] ^= 0x55
         (folder / "a.png").write_bytes(damaged)
-        assert "found" in refused(folder, "a.png")
+        assert "got" in refused(folder, "a.png")
 
 
 @pytest.mark.parametrize("name", ["a.exr", "a.npy"])
@@ -284,7 +284,7 @@ def test_truncated_float_files_are_refused(folder, name):
     whole = (folder / name).read_bytes()
     for length in (len(whole) // 2, len(whole) - 8):
         (folder / name).write_bytes(whole[:length])
-        assert refused(folder, name).startswith("found a file that cannot be read")
+        assert refused(folder, name).startswith("got a file that cannot be read")
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -298,13 +298,13 @@ def test_values_that_are_not_finite_are_refused(folder, value):
     with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"RGB": image}) as file:
         file.write(str(folder / "a.exr"))
     for name in ("a.npy", "a.exr"):
-        assert refused(folder, name) == "found a value that is not finite at column 2, row 1, expected finite ones"
+        assert refused(folder, name) == "got a value that is not finite at column 2, row 1, expected finite ones"
 
 
 def test_values_too_large_for_float32_are_refused(folder):
     """Without a warning, which would be a second line."""
     np.save(folder / "a.npy", np.full((2, 3, 3), 1e300))
-    assert refused(folder, "a.npy").startswith("found a value that is not finite at column 0, row 0")
+    assert refused(folder, "a.npy").startswith("got a value that is not finite at column 0, row 0")
 
 
 @pytest.mark.parametrize(
@@ -322,7 +322,7 @@ def test_numpy_files_of_other_kinds_are_refused(folder, array, found):
     """Whole numbers may mean 0 to 255 or 0 to 1, so they are not guessed at; nor are grey images."""
     np.save(folder / "a.npy", array)
     expected = "floating-point numbers of shape (H, W, 3) or (H, W, 4)"
-    assert refused(folder, "a.npy") == f"found {found}, expected {expected}"
+    assert refused(folder, "a.npy") == f"got {found}, expected {expected}"
 
 
 def test_half_and_double_precision(folder):
@@ -346,12 +346,12 @@ def test_openexr_channels(folder):
     assert compared(folder, write(Y=plane)).shape == (2, 3, 3)
     assert compared(folder, write(Y=plane, A=plane)).shape == (2, 3, 4)
     assert compared(folder, write(R=plane, G=plane, B=plane, Z=7.0 * plane)).shape == (2, 3, 3)
-    assert refused(folder, write(Y=plane, RY=plane, BY=plane)).startswith("found the channels BY, RY, Y, expected")
+    assert refused(folder, write(Y=plane, RY=plane, BY=plane)).startswith("got the channels BY, RY, Y, expected")
     layer = {f"beauty.{name}": plane for name in "RGB"}
-    assert "found the channels beauty.B, beauty.G, beauty.R" in refused(folder, write(**layer))
+    assert "got the channels beauty.B, beauty.G, beauty.R" in refused(folder, write(**layer))
     window = {"displayWindow": (np.int32([0, 0]), np.int32([2, 1])), "dataWindow": (np.int32([1, 0]), np.int32([3, 1]))}
     message = refused(folder, write(window, R=plane, G=plane, B=plane))
-    assert message.startswith("found pixels of the window [[1, 0], [3, 1]]")
+    assert message.startswith("got pixels of the window [[1, 0], [3, 1]]")
 
 
 @pytest.mark.parametrize("image", ["3", "[1, 2]", "true"])
@@ -359,7 +359,7 @@ def test_name_must_be_text(folder, image):
     """The study file and the key are told."""
     (folder / "scene.toml").write_text(SCENE.format(background=OPAQUE))
     (folder / "study.toml").write_text(STUDY.format(image="").replace('image = ""', f"image = {image}"))
-    with pytest.raises(StudyError, match=r"study\.toml: reference\.image: found"):
+    with pytest.raises(StudyError, match=r"study\.toml: reference\.image: (found|got)"):
         load_study(folder / "study.toml")
 
 
@@ -367,15 +367,15 @@ def test_name_must_be_text(folder, image):
 def test_arrays_of_other_shapes_are_refused(folder, shape):
     """A reference that is given as an array has to fit the camera, too."""
     study = prepare(folder, save(folder, RGB)).study
-    with pytest.raises(StudyError, match=r"^reference.image: found [^\n]+$"):
+    with pytest.raises(StudyError, match=r"^reference.image: got [^\n]+$"):
         Study(study.scene, Reference(image=np.zeros(shape)), {"beta": 0.5})
 
 
 @pytest.mark.parametrize(
     ("image", "words"),
     [
-        (np.zeros((2, 3, 3), np.uint8), "found uint8 of shape"),
-        (np.full((2, 3, 3), np.nan), "found a value that is not finite at column 0, row 0"),
+        (np.zeros((2, 3, 3), np.uint8), "got uint8 of shape"),
+        (np.full((2, 3, 3), np.nan), "got a value that is not finite at column 0, row 0"),
         ("a.png", "expected linear floating-point numbers"),
         ([[1.0], [2.0, 3.0]], "expected linear floating-point numbers"),
     ],

@@ -161,9 +161,9 @@ def test_missing_package_is_named(tmp_path, monkeypatch, module, extra):
 def test_mistakes_get_one_line(tmp_path, made):
     """A file in place of the folder, and steps below 1, are refused."""
     (tmp_path / "file").write_text("")
-    with pytest.raises(ValueError, match="file: found a file, expected a folder"):
+    with pytest.raises(ValueError, match="file: got a file, expected a folder"):
         TensorBoard(tmp_path / "file")
-    with pytest.raises(ValueError, match="image_steps: found 0"):
+    with pytest.raises(ValueError, match="image_steps: got 0"):
         TensorBoard(tmp_path, image_steps=0)
 
 

@@ -8,7 +8,8 @@ import pytest
 
 from warpfrag.scene.assemble import assemble
 from warpfrag.scene.camera import Camera
-from warpfrag.scene.scene import Scene, SceneObject
+from warpfrag.scene.scene import Scene
+from warpfrag.scene.surface import SceneObject
 
 CAMERA = Camera(eye=(0, 0, 3), target=(0, 0, 0), fov=45, size=(4, 3))
 TRIANGLE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype=np.float32)
@@ -48,7 +49,8 @@ def test_flat_arrays():
     np.testing.assert_array_equal(geometry.texture_id, [-1, 0, 0])
     np.testing.assert_array_equal(geometry.uv, np.concatenate([np.zeros((3, 2)), SQUARE[:, :2]]))
     assert (len(geometry.textures), geometry.thickness_maps) == (1, {})
-    assert geometry.vertices.dtype == geometry.rgba.dtype == geometry.thickness.dtype == np.float32
+    assert geometry.rgba.dtype == geometry.thickness.dtype == np.float32
+    assert (geometry.vertices.dtype, geometry.precision) == (np.float64, "float32")
     assert geometry.faces.dtype == geometry.object_id.dtype == geometry.first_face.dtype == np.int32
 
 
@@ -83,7 +85,7 @@ def test_parameters_round_trip():
     same = assemble(scene, parameters)
     for name in ("vertices", "rgba", "thickness"):
         np.testing.assert_array_equal(getattr(same, name), getattr(assemble(scene), name))
-        assert getattr(same, name).dtype == np.float32
+        assert getattr(same, name).dtype == getattr(assemble(scene), name).dtype
     parameters["tri.vertices"][:] = 9
     assert scene.objects[0].vertices.max() == 1
 
@@ -107,9 +109,7 @@ def test_thickness_map():
     np.testing.assert_array_equal(geometry.thickness, [0.25] * 3 + [0] * 4)
     large = {"square.thickness": np.ones((6, 8))}
     assert assemble(scene, large, camera=CAMERA.resized((8, 6))).thickness_maps[1].shape == (6, 8)
-    with pytest.raises(
-        ValueError, match=r"found shape \(6, 8\), expected shape \(\), \(4,\) or a map of shape \(3, 4\)"
-    ):
+    with pytest.raises(ValueError, match=r"got shape \(6, 8\), expected shape \(\), \(4,\) or a map of shape \(3, 4\)"):
         assemble(scene, large)
 
 
@@ -132,33 +132,33 @@ def test_one_thickness_for_all_objects():
     ("overrides", "error", "words"),
     [
         ({"squar.color": 1.0}, ValueError, 'unknown name "squar.color"; did you mean "square.color"?'),
-        ({"tri.opacity": 1.5}, ValueError, "tri.opacity: found 1.5, expected numbers from 0 to 1"),
-        ({"tri.opacity": float("nan")}, ValueError, "tri.opacity: found nan"),
-        ({"tri.thickness": -1}, ValueError, "tri.thickness: found -1, expected numbers from 0"),
-        ({"tri.thickness": np.inf}, ValueError, "tri.thickness: found inf"),
-        ({"tri.color": [1, 2]}, ValueError, r"tri.color: found shape \(2,\), expected shape \(3,\) or \(3, 3\)"),
-        ({"tri.color": [0, -1, 0]}, ValueError, "tri.color: found -1"),
-        ({"tri.color": "red"}, TypeError, "tri.color: found builtins.str, expected a number, a NumPy array or a torch"),
+        ({"tri.opacity": 1.5}, ValueError, "tri.opacity: got 1.5, expected numbers from 0 to 1"),
+        ({"tri.opacity": float("nan")}, ValueError, "tri.opacity: got nan"),
+        ({"tri.thickness": -1}, ValueError, "tri.thickness: got -1, expected numbers from 0"),
+        ({"tri.thickness": np.inf}, ValueError, "tri.thickness: got inf"),
+        ({"tri.color": [1, 2]}, ValueError, r"tri.color: got shape \(2,\), expected shape \(3,\) or \(3, 3\)"),
+        ({"tri.color": [0, -1, 0]}, ValueError, "tri.color: got -1"),
+        ({"tri.color": "red"}, ValueError, 'tri.color: got "red", expected 3 numbers or "#rrggbb"'),
         ({"tri.color": [[1], 2]}, ValueError, "tri.color: .*expected numbers"),
-        ({"tri.opacity": True}, TypeError, "tri.opacity: found builtins.bool"),
-        ({"tri.vertices": SQUARE}, ValueError, r"tri.vertices: found shape \(4, 3\), expected shape \(3, 3\)"),
-        ({"tri.vertices": TRIANGLE + np.inf}, ValueError, "tri.vertices: found inf"),
+        ({"tri.opacity": True}, TypeError, "tri.opacity: got builtins.bool"),
+        ({"tri.vertices": SQUARE}, ValueError, r"tri.vertices: got shape \(4, 3\), expected shape \(3, 3\)"),
+        ({"tri.vertices": TRIANGLE + np.inf}, ValueError, "tri.vertices: got inf"),
         ([("tri.color", 1)], TypeError, "expected a mapping"),
-        ({"tri.rotation": 1.0}, ValueError, r"tri.rotation: found shape \(\), expected shape \(3,\)"),
+        ({"tri.rotation": 1.0}, ValueError, r"tri.rotation: got shape \(\), expected shape \(3,\)"),
         (
             {"tri.translation": [0, np.nan, 0]},
             ValueError,
-            "tri.translation: found nan, expected numbers that are finite",
+            "tri.translation: got nan, expected numbers that are finite",
         ),
-        ({"camera.rotation": [1, 2]}, ValueError, r"camera.rotation: found shape \(2,\), expected shape \(3,\)"),
+        ({"camera.rotation": [1, 2]}, ValueError, r"camera.rotation: got shape \(2,\), expected shape \(3,\)"),
         ({"camera.turn": [1, 2]}, ValueError, 'unknown name "camera.turn"'),
-        ({"thickness": [1, 2, 3]}, ValueError, r"thickness: found shape \(3,\), expected shape \(\) or a map of shape"),
-        ({"thickness": -1}, ValueError, "thickness: found -1, expected numbers from 0, finite"),
+        ({"thickness": [1, 2, 3]}, ValueError, r"thickness: got shape \(3,\), expected shape \(\) or a map of shape"),
+        ({"thickness": -1}, ValueError, "thickness: got -1, expected numbers from 0, finite"),
         ({"thicknes": 1}, ValueError, 'unknown name "thicknes"; did you mean "thickness"?'),
     ],
 )
 def test_refused_overrides(overrides, error, words):
-    """Names, kinds, shapes and ranges are checked, with what was found and what is expected."""
+    """Names, kinds, shapes and ranges are checked, with what was got and what is expected."""
     with pytest.raises(error, match=words):
         assemble(two_objects(), overrides)
 
@@ -167,16 +167,16 @@ def test_refused_overrides(overrides, error, words):
     ("change", "words"),
     [
         ({"name": " "}, "name"),
-        ({"faces": [[0, 1, 3]]}, "x.faces: found indices 0 to 3, expected indices from 0 to 2"),
-        ({"faces": [[0.0, 1.0, 2.0]]}, "x.faces: found float64"),
-        ({"vertices": TRIANGLE + np.nan}, "x.vertices: found nan"),
+        ({"faces": [[0, 1, 3]]}, "x.faces: got indices 0 to 3, expected indices from 0 to 2"),
+        ({"faces": [[0.0, 1.0, 2.0]]}, "x.faces: got float64"),
+        ({"vertices": TRIANGLE + np.nan}, "x.vertices: got nan"),
         ({"matrix": np.zeros((4, 4))}, "x.matrix"),
-        ({"opacity": 2}, "x.opacity: found 2"),
+        ({"opacity": 2}, "x.opacity: got 2"),
         ({"thickness_unit": "m"}, "x.thickness_unit"),
-        ({"texture": np.ones((2, 2, 4))}, "x.texture: found an image but no uv"),
-        ({"texture": np.ones((2, 2, 3)), "uv": np.zeros((3, 2))}, r"x.texture: found shape \(2, 2, 3\)"),
-        ({"uv": np.zeros((2, 2))}, r"x.uv: found shape \(2, 2\)"),
-        ({"shade": np.zeros(2)}, r"x.shade: found shape \(2,\)"),
+        ({"texture": np.ones((2, 2, 4))}, "x.texture: got an image but no uv"),
+        ({"texture": np.ones((2, 2, 3)), "uv": np.zeros((3, 2))}, r"x.texture: got shape \(2, 2, 3\)"),
+        ({"uv": np.zeros((2, 2))}, r"x.uv: got shape \(2, 2\)"),
+        ({"shade": np.zeros(2)}, r"x.shade: got shape \(2,\)"),
     ],
 )
 def test_refused_objects(change, words):
@@ -194,9 +194,9 @@ def test_refused_scenes(change):
     with pytest.raises(ValueError, match=next(iter(change))):
         Scene(CAMERA, **change)
     item = SceneObject("x", TRIANGLE, [[0, 1, 2]])
-    with pytest.raises(ValueError, match='found the name "x" more than once'):
+    with pytest.raises(ValueError, match='got the name "x" more than once'):
         Scene(CAMERA, [item, item])
-    with pytest.raises(ValueError, match='found the name "camera", expected another'):
+    with pytest.raises(ValueError, match='got the name "camera", expected another'):
         Scene(CAMERA, [SceneObject("camera", TRIANGLE, [[0, 1, 2]])])
 
 
@@ -207,13 +207,13 @@ def test_torch_overrides_keep_their_precision():
     for dtype in (torch.float32, torch.float64):
         geometry = assemble(scene, {"tri.opacity": torch.tensor(0.5, dtype=dtype)})
         for name in ("vertices", "rgba", "thickness"):
-            assert getattr(geometry, name).dtype == dtype
+            assert getattr(geometry, name).dtype == (torch.float64 if name == "vertices" else dtype)
             np.testing.assert_allclose(getattr(geometry, name).numpy(), getattr(assemble(scene), name), rtol=1e-7)
         assert isinstance(geometry.faces, np.ndarray)
     assert isinstance(assemble(scene, {"beta": torch.tensor(0.5)}).vertices, torch.Tensor)
-    with pytest.raises(ValueError, match=r"tri.opacity: found a tensor of torch.float16"):
+    with pytest.raises(ValueError, match=r"tri.opacity: got a torch.Tensor of float16"):
         assemble(scene, {"tri.opacity": torch.tensor(0.5, dtype=torch.float16)})
-    with pytest.raises(ValueError, match=r"tri.opacity: found 2, expected numbers from 0 to 1"):
+    with pytest.raises(ValueError, match=r"tri.opacity: got 2, expected numbers from 0 to 1"):
         assemble(scene, {"tri.opacity": torch.tensor(2.0)})
 
 
@@ -238,7 +238,8 @@ def test_no_heavy_imports():
     """Importing the room and assembling a scene loads neither torch nor any file reader."""
     code = (
         "import sys; from warpfrag.scene.assemble import assemble; from warpfrag.scene.camera import Camera\n"
-        "from warpfrag.scene.scene import Scene, SceneObject; from warpfrag.shapes import primitives as p\n"
+        "from warpfrag.scene.scene import Scene; from warpfrag.scene.surface import SceneObject\n"
+        "from warpfrag.shapes import primitives as p\n"
         "m = p.cube(); c = Camera(eye=(0, 0, 3), target=(0, 0, 0), fov=45)\n"
         "assemble(Scene(c, [SceneObject('a', m.vertices, m.faces)]), {'a.opacity': 0.5})\n"
         "heavy = {'torch', 'trimesh', 'pxr', 'PIL', 'scipy', 'matplotlib'} & set(sys.modules)\n"

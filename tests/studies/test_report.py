@@ -158,7 +158,7 @@ def test_failed_study_leaves_the_others(run, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("lost", "message"), [("README.md", "README.md: found no"), ("figures/shown.png", "no such picture")]
+    ("lost", "message"), [("README.md", "README.md: got no"), ("figures/shown.png", "no such picture")]
 )
 def test_study_without_readme_or_picture_has_failed(run, tmp_path, lost, message):
     """What is missing is named in the row, and in the run that is returned."""

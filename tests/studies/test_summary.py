@@ -102,7 +102,7 @@ def test_load_returns_what_was_saved(folder):
 @pytest.mark.parametrize(
     ("readme", "message"),
     [
-        (None, "README.md: found no file"),
+        (None, "README.md: got no file"),
         (b"text", "0 times, expected it once"),
         (f"{BEGIN} {BEGIN} {END}".encode(), "2 times"),
         (f"{END} {BEGIN}".encode(), "expected it after"),
@@ -125,7 +125,7 @@ def test_save_needs_its_figures(folder):
     """A figure that was not drawn is named, and nothing is written."""
     (folder / "figures" / "speckle.png").unlink()
     before = contents(folder.parent)
-    with pytest.raises(SummaryError, match=r"speckle.png: found no such file"):
+    with pytest.raises(SummaryError, match=r"speckle.png: got no such file"):
         SUMMARY.save(folder)
     assert contents(folder.parent) == before
 
@@ -150,11 +150,11 @@ def test_save_writes_all_or_nothing(folder, monkeypatch):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Summary("a/b", "", "", ""), "name: found 'a/b'"),
-        (lambda: Summary("a", "", "", "", numbers={"error": float("nan")}), "error: found nan, expected a finite"),
-        (lambda: Summary("a", "", "", "", numbers={"error": "1"}), "error: found '1', expected a number"),
-        (lambda: Table(("a", "b"), (("x", 1), ("y",))), "found 1 cells in row 2, expected 2"),
-        (lambda: Table(("a",), ((float("inf"),),)), "found inf"),
+        (lambda: Summary("a/b", "", "", ""), "name: got 'a/b'"),
+        (lambda: Summary("a", "", "", "", numbers={"error": float("nan")}), "error: got nan, expected a finite"),
+        (lambda: Summary("a", "", "", "", numbers={"error": "1"}), "error: got '1', expected a number"),
+        (lambda: Table(("a", "b"), (("x", 1), ("y",))), "got 1 cells in row 2, expected 2"),
+        (lambda: Table(("a",), ((float("inf"),),)), "got inf"),
     ],
 )
 def test_refuses_what_cannot_be_written(make, message):
@@ -169,5 +169,5 @@ def test_load_refuses_what_is_no_summary(tmp_path, content):
     path = tmp_path / "summary.json"
     if content is not None:
         path.write_bytes(content)
-    with pytest.raises(SummaryError, match=r"summary.json: found no"):
+    with pytest.raises(SummaryError, match=r"summary.json: got no"):
         Summary.load(path)

@@ -54,20 +54,20 @@ class TorchKind(Kind):
 
     def call(self, operator: Operator, inputs: SimpleNamespace, options: Any) -> SimpleNamespace:
         arrays = [wp.to_torch(a) if isinstance(a, wp.array) else a for a in vars(inputs).values()]
-        for each, array in zip(operator.inputs, arrays, strict=False):
-            # A custom operator would drop the tangent without a word.
-            if array is not None and forward_ad.unpack_dual(array).tangent is not None:
-                raise NotImplementedError(
-                    f"warpfrag.{operator.name}: got a forward-mode derivative in {each.name}, expected none (gradients "
-                    "are those of backward)"
-                )
-        outputs = getattr(torch.ops.warpfrag, operator.name)(
-            *arrays, *(getattr(options, name) for name in operator.option_names)
-        )
+        # A custom operator would drop a tangent without a word.
+        if any(array is not None and forward_ad.unpack_dual(array).tangent is not None for array in arrays):
+            raise _no_forward_mode(operator.name)
+        values = [getattr(options, name) for name in operator.option_names]
+        if torch._C._are_functorch_transforms_active():
+            outputs = _Transformed.apply(operator.name, *arrays, *values)
+        else:
+            outputs = getattr(torch.ops.warpfrag, operator.name)(*arrays, *values)
         return named(operator.outputs, outputs if isinstance(outputs, tuple) else (outputs,))
 
 
 KIND = TorchKind()
+# What torch was told, by the operator's name.
+_REGISTERED: "dict[str, _Registration]" = {}
 
 
 class _Registration:
@@ -136,12 +136,10 @@ class _Registration:
         ctx.options = inputs[self.argument_count :]
         ctx.save_for_backward(*inputs[: self.argument_count])
 
-    def differentiate(self, backward_op: Any, ctx: Any, *grads: Any) -> tuple[Any, ...]:
-        """Return the gradient of every argument, None where there is none."""
+    def differentiate(self, backward_op: Any, wanted: Sequence[bool], ctx: Any, *grads: Any) -> tuple[Any, ...]:
+        """Return the gradient of every argument, None where there is none or it is not wanted."""
         nothing: list[Any] = [None] * (len(self.operator.tables) + len(self.operator.option_names))
-        needed = [
-            bool(need) and each.gradient for each, need in zip(self.operator.inputs, ctx.needs_input_grad, strict=False)
-        ]
+        needed = [bool(need) and each.gradient for each, need in zip(self.operator.inputs, wanted, strict=False)]
         if self.operator.backward is None or not any(needed) or all(grad is None for grad in grads):
             return (*[None] * len(needed), *nothing)
         found = iter(backward_op(*grads, needed, *ctx.saved_tensors, *ctx.options))
@@ -156,7 +154,7 @@ class _Registration:
 
 def register(operator: Operator) -> None:
     """Define `torch.ops.warpfrag.<name>` and `<name>_backward`: what they compute, their shapes, their gradient."""
-    told = _Registration(operator)
+    told = _REGISTERED[operator.name] = _Registration(operator)
     outputs = ", ".join(["Tensor"] * told.output_count)
     grads = ", ".join(f"Tensor? grad_{each.name}" for each in operator.outputs)
     forward_op = torch.library.custom_op(
@@ -173,9 +171,72 @@ def register(operator: Operator) -> None:
     backward_op.register_autograd(told.refuse)
 
     def differentiate(ctx: Any, *grads: Any) -> tuple[Any, ...]:
-        return told.differentiate(backward_op, ctx, *grads)
+        return told.differentiate(backward_op, ctx.needs_input_grad, ctx, *grads)
 
     forward_op.register_autograd(differentiate, setup_context=told.remember)
+    for op in (forward_op, backward_op):
+        op.register_vmap(lambda info, in_dims, *arguments, op=op: _one_by_one(op, info, in_dims, arguments))
+
+
+def _no_forward_mode(name: str) -> NotImplementedError:
+    return NotImplementedError(
+        f"warpfrag.{name}: got a forward-mode derivative, expected a gradient (backward, torch.func.grad or jacrev)"
+    )
+
+
+def _one_by_one(call: Any, info: Any, in_dims: Any, arguments: Sequence[Any]) -> Any:
+    """Return what an operator gives for each entry of a batch, stacked, and in which dimension."""
+    results = []
+    for entry in range(info.batch_size):
+        picked = [
+            argument.select(dim, entry) if isinstance(argument, torch.Tensor) and dim is not None else argument
+            for argument, dim in zip(arguments, in_dims, strict=True)
+        ]
+        results.append(call(*picked))
+    if isinstance(results[0], (tuple, list)):
+        return type(results[0])(map(torch.stack, zip(*results, strict=True))), type(results[0])([0] * len(results[0]))
+    return torch.stack(results), 0
+
+
+class _Transformed(torch.autograd.Function):
+    """An operator inside of `torch.func`'s transforms (grad, jacrev, vmap), which a custom operator does not take."""
+
+    @staticmethod
+    def forward(name: str, *arguments: Any) -> Any:
+        with torch._C._AutoDispatchBelowAutograd():
+            outputs = getattr(torch.ops.warpfrag, name)(*arguments)
+        return tuple(outputs) if isinstance(outputs, list) else outputs
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: Sequence[Any], output: Any) -> None:
+        name, *arguments = inputs
+        ctx.name = name
+        if name in _REGISTERED:
+            _REGISTERED[name].remember(ctx, arguments, output)
+            ctx.mark_non_differentiable(
+                *(o for o in output if not o.is_floating_point()) if isinstance(output, tuple) else ()
+            )
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Any) -> Any:
+        if ctx.name not in _REGISTERED:
+            _REGISTERED[ctx.name.removesuffix("_backward")].refuse(ctx)
+        told = _REGISTERED[ctx.name]
+
+        def backward_op(*arguments: Any) -> Any:
+            found = _Transformed.apply(f"{ctx.name}_backward", *arguments)
+            return found if isinstance(found, tuple) else (found,)
+
+        needed = ctx.needs_input_grad[1:]
+        return (None, *told.differentiate(backward_op, needed, ctx, *grads))
+
+    @staticmethod
+    def vmap(info: Any, in_dims: Any, *arguments: Any) -> Any:
+        return _one_by_one(_Transformed.apply, info, in_dims, arguments)
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Any:
+        raise _no_forward_mode(ctx.name)
 
 
 def _shared(tensors: SimpleNamespace) -> SimpleNamespace:

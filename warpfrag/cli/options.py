@@ -11,7 +11,8 @@ import typer
 from warpfrag.errors import range_wording, shorten, suggest
 
 if TYPE_CHECKING:
-    from warpfrag.scene.scene import Scene, SceneObject
+    from warpfrag.scene.scene import Scene
+    from warpfrag.scene.surface import SceneObject
 
 _SIZE = re.compile(r"(\d{1,9})\s*[xX×]\s*(\d{1,9})")
 _VERTICES = ".vertices"
@@ -124,7 +125,7 @@ def parse_background(text: str) -> tuple[float, float, float, float]:
 
 def parse_thickness(option: str, text: str) -> dict[str, Any]:
     """Read a z-thickness as the fields of an object that it changes."""
-    from warpfrag.scene.scene import multiple_of_p
+    from warpfrag.scene.parameters import multiple_of_p
 
     multiple = multiple_of_p(text)
     if multiple is not None:
@@ -135,7 +136,8 @@ def parse_thickness(option: str, text: str) -> dict[str, Any]:
 
 def with_values(scene: "Scene", values: Mapping[str, Any]) -> "Scene":
     """Return a scene with parameters built in; poses last, as a turn is about the middle of what is there."""
-    from warpfrag.scene.pose import POSE_KEYS, posed
+    from warpfrag.scene.names import POSE_KEYS
+    from warpfrag.scene.pose import posed
 
     objects = []
     for item in scene.objects:
@@ -182,7 +184,7 @@ def _split(setting: str, scene: "Scene") -> tuple[str, str]:
 
 def _parse_value(name: str, text: str) -> Any:
     from warpfrag.colors import parse_hex
-    from warpfrag.scene.pose import POSE_KEYS
+    from warpfrag.scene.names import POSE_KEYS
 
     option, key = f"--set {name}", name.rpartition(".")[2]
     if key in POSE_KEYS:

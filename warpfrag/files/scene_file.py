@@ -20,7 +20,8 @@ from warpfrag.files.examples import example_path
 from warpfrag.files.scene_objects import read_objects
 from warpfrag.files.table import Table, read_toml
 from warpfrag.scene.camera import Camera
-from warpfrag.scene.scene import MERGES, MIXES, Scene
+from warpfrag.scene.names import MERGES, MIXES
+from warpfrag.scene.scene import Scene
 
 _TOP = ("beta", "layers", "merge", "mix", "background", "camera", "light", "object")
 CAMERA_KEYS = ("eye", "target", "up", "fov", "height", "near", "far", "size")

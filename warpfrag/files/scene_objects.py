@@ -27,8 +27,9 @@ from warpfrag.files.points import load_points
 from warpfrag.files.source import resolved
 from warpfrag.files.table import Table, is_numbers
 from warpfrag.scene.camera import Camera
-from warpfrag.scene.pose import CAMERA
-from warpfrag.scene.scene import SceneObject, multiple_of_p
+from warpfrag.scene.names import CAMERA
+from warpfrag.scene.parameters import multiple_of_p
+from warpfrag.scene.surface import SceneObject
 from warpfrag.shapes import primitives
 from warpfrag.shapes.mesh import GREY, Mesh, lambert, smooth_normals, split_faces, transformed_normals
 from warpfrag.shapes.surfels import surfels

@@ -122,8 +122,16 @@ class Source:
         """Read the file itself."""
         return read_regular(self.path, "a mesh file")
 
-    def find(self, name: str) -> Path | None:
-        """Return where a file that this one names lies; None, and noted, where it is missing or outside of the root."""
+    def find(self, name: str, *, quiet: bool = False) -> Path | None:
+        """Return where a file that this one names lies.
+
+        Args:
+            name: what the file says.
+            quiet: whether a name that leads to nothing is not to be told.
+
+        Returns:
+            Its path; None, and noted, where it is missing or outside of the root.
+        """
         name = name.strip()
         # Exporters write percent-encoded names, backslashes, and absolute paths of their own machine.
         candidates = [name, unquote(name), name.replace("\\", "/"), PureWindowsPath(name).name]
@@ -136,7 +144,8 @@ class Source:
                 outside = True
             elif wording_unless_regular(path) is None:
                 return path
-        (self._outside if outside else self._missing).append(name)
+        if not quiet:
+            (self._outside if outside else self._missing).append(name)
         return None
 
     def note(self, text: str) -> None:

@@ -1,109 +1,157 @@
-"""USD files (usd, usda, usdc, usdz) through usd-core.
+"""USD files (usd, usda, usdc, usdz) through usd-core, in a process of its own with limits of time and memory.
 
-Every visible mesh of the stage, instances included, with its world transform at the earliest time. Units and the up
-axis stay as the file has them: a file with z up stays so (turn it with `rotate`). Polygons become fans of triangles;
-subdivision surfaces are their control mesh. Colour and opacity are displayColor and displayOpacity (linear), else the
-constants of a bound UsdPreviewSurface; its textures are not read.
+Every visible mesh of the stage, instances and those of point instancers included, with its world transform at one time.
+Units and the up axis stay as the file has them: a file with z up stays so (turn it with `rotate`). Subdivision surfaces
+are their control mesh. Colour and opacity are those of a bound UsdPreviewSurface, of the mesh or of subsets of its
+faces, else displayColor and displayOpacity (linear), inherited ones too; its images are not read.
 """
 
+import json
+import signal
+import subprocess
+import sys
+import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from warpfrag.extras import need
-from warpfrag.shapes.mesh import Mesh, transformed_normals
+from warpfrag.files.polygons import cut_polygons
+from warpfrag.files.source import Source, resolved
+from warpfrag.shapes.mesh import GREY, Mesh, placed
+
+# Limits of the process that reads: address space, and time, which grows with the size of the file.
+MOST_BYTES = 4 * 2**30
+MOST_SECONDS, BYTES_PER_SECOND = 60.0, 10 * 2**20
+SCRIPT = Path(__file__).with_name("usd_stage.py")
 
 
-def load_usd(path: Path, root: Path) -> tuple[list[Mesh], str]:
-    """Read the meshes of a stage; see `load_mesh`.
+def read_usd(source: Source) -> tuple[list[Mesh], str]:
+    """Read the meshes of a stage, one for each of its meshes, with the name of its prim.
 
     Returns:
-        The meshes, and words about what else the stage holds when there are none.
+        The meshes in world space, and words about what else the stage holds.
 
     Raises:
-        ValueError: the file cannot be read, or it refers to a file outside of `root`.
+        ValueError: the file cannot be read, within its limits, or it refers to a file outside of its root folder.
         ImportError: usd-core is not installed.
     """
     need("pxr", "usd", "Reading USD files")
-    from pxr import Tf, Usd, UsdGeom
-
-    try:
-        stage = Usd.Stage.Open(str(path))
-    except Tf.ErrorException as error:
-        reason = str(error).strip().splitlines()[-1].strip()[:120]
-        raise ValueError(f"got a USD file that cannot be read: {path} ({reason})") from error
-    for layer in stage.GetUsedLayers():
-        used = layer.realPath.split("[")[0]
-        if used and Path(used).resolve() != path.resolve() and not Path(used).resolve().is_relative_to(root.resolve()):
-            raise ValueError(f"got a reference to {used} in {path}, expected references inside {root}")
-    time = Usd.TimeCode.EarliestTime()
-    transforms = UsdGeom.XformCache(time)
-    parts, kinds = [], set()
-    for prim in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()):
-        if prim.IsA(UsdGeom.Gprim) or prim.IsA(UsdGeom.PointInstancer):
-            kinds.add(str(prim.GetTypeName()))
-        if not prim.IsA(UsdGeom.Mesh):
-            continue
-        shown = UsdGeom.Imageable(prim)
-        if shown.ComputeVisibility(time) == "invisible" or shown.ComputePurpose() in ("guide", "proxy"):
-            continue
-        mesh = _mesh(prim, np.array(transforms.GetLocalToWorldTransform(prim)).T, time)
+    told, arrays = _run(source)
+    if "refused" in told:
+        raise ValueError(told["refused"])
+    if "error" in told:
+        raise ValueError(_memory() if told["error"] == "memory" else told["error"])
+    parts = []
+    for number, entry in enumerate(told["meshes"]):
+        prefix = f"{number}."
+        own = {key.removeprefix(prefix): values for key, values in arrays.items() if key.startswith(prefix)}
+        mesh = _mesh(entry, own)
         if mesh is not None:
             parts.append(mesh)
-    return parts, f" (it holds {', '.join(sorted(kinds))})" if kinds else ""
+    for note in told["notes"]:
+        source.note(note)
+    kinds = told["kinds"]
+    if kinds and parts:
+        source.note(f"{', '.join(kinds)} {'is' if len(kinds) == 1 else 'are'} not drawn")
+    return parts, f" (it holds {', '.join(kinds)})" if kinds else ""
 
 
-def _mesh(prim: Any, matrix: np.ndarray, time: Any) -> Mesh | None:
-    from pxr import UsdGeom
+def _run(source: Source) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Let a process of its own read the stage; return what it tells and its arrays."""
+    path = resolved(source.path)
+    seconds = MOST_SECONDS + path.stat().st_size / BYTES_PER_SECOND
+    with tempfile.TemporaryDirectory() as folder:
+        output = Path(folder) / "stage.npz"
+        command = [sys.executable, "-P", str(SCRIPT), str(path), str(source.root), str(output), str(MOST_BYTES)]
+        try:
+            done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, timeout=seconds, check=False)
+        except subprocess.TimeoutExpired as error:
+            raise ValueError(f"its reader took more than {seconds:.0f} s") from error
+        if done.returncode or not output.is_file():
+            words = done.stderr.decode("utf-8", "replace").strip().splitlines()[-1:]
+            if done.returncode < 0:
+                name = signal.Signals(-done.returncode).name
+                # What runs out of memory in native code is mostly aborted.
+                why = _memory() if name == "SIGABRT" and "alloc" in str(words) else f"its reader was ended by {name}"
+                raise ValueError(why)
+            raise ValueError(_memory() if "MemoryError" in str(words) else " ".join(words)[:160] or "its reader failed")
+        with np.load(output, allow_pickle=False) as stored:
+            arrays = {key: stored[key] for key in stored.files}
+    return json.loads(str(arrays.pop("told"))), arrays
 
-    mesh = UsdGeom.Mesh(prim)
-    points = np.asarray(mesh.GetPointsAttr().Get(time), dtype=np.float64)
-    counts = np.asarray(mesh.GetFaceVertexCountsAttr().Get(time), dtype=np.int64)
-    indices = np.asarray(mesh.GetFaceVertexIndicesAttr().Get(time), dtype=np.int64)
-    if points.ndim != 2 or counts.ndim != 1 or indices.ndim != 1 or not len(counts):
-        return None
-    where = f"got a USD mesh that cannot be read: {prim.GetPath()}"
+
+def _memory() -> str:
+    return f"its reader needed more than {MOST_BYTES / 2**30:g} GiB of memory"
+
+
+def _mesh(told: dict[str, Any], arrays: dict[str, np.ndarray]) -> Mesh | None:
+    points, counts, indices = arrays["points"], arrays["counts"], arrays["indices"]
+    where = f"got a USD mesh that cannot be read: {told['path']}"
     if counts.min() < 0 or counts.sum() != len(indices):
         raise ValueError(f"{where} (its faces need {counts.sum()} indices, it has {len(indices)})")
     if len(indices) and (indices.min() < 0 or indices.max() >= len(points)):
         raise ValueError(f"{where} (a face names vertex {indices.max()}, there are {len(points)})")
     if not np.isfinite(points).all():
         raise ValueError(f"{where} (a vertex is not finite)")
-    face_of, corners = _fan(counts)
+    face_of, corners = cut_polygons(points, counts, indices)
+    if len(arrays["holes"]):
+        kept = ~np.isin(face_of, arrays["holes"])
+        face_of, corners = face_of[kept], corners[kept]
     if not len(corners):
         return None
-    points = points @ matrix[:3, :3].T + matrix[:3, 3]
-    color, color_where = _primvar(mesh.GetDisplayColorPrimvar(), time)
-    opacity, opacity_where = _primvar(mesh.GetDisplayOpacityPrimvar(), time)
-    if color is None and opacity is None:
-        color, opacity = _preview_surface(prim)
-        color_where = opacity_where = "constant"
-    normals, normal_where = _normals(mesh, time)
-    attributes = {
-        "color": (color, color_where),
-        "opacity": (opacity, opacity_where),
-        "normals": (normals, normal_where),
-    }
+    if told["mirrored"]:
+        corners = corners[:, ::-1]
+    attributes = {key: (arrays.get(key), told.get(key, "constant")) for key in ("color", "opacity", "normals")}
+    normals, normal_where = attributes["normals"]
+    if normals is not None and (normals.ndim != 2 or normal_where == "constant" or not np.isfinite(normals).all()):
+        attributes["normals"] = (None, "constant")
+    for key, default in (("color", np.full(3, GREY)), ("opacity", np.ones(()))):
+        attributes[key] = _with_looks(key, attributes[key], told["looks"], arrays, default)
     source, vertex_of, values = _vertices(attributes, face_of, corners.reshape(-1), indices, len(points))
-    vertices, faces = points[source], vertex_of.reshape(-1, 3)
-    if values["normals"] is not None:
-        values["normals"] = transformed_normals(values["normals"], matrix)
     if values["color"] is not None:
         values["color"] = np.maximum(values["color"], 0.0)
     if values["opacity"] is not None:
         values["opacity"] = np.clip(values["opacity"], 0.0, 1.0)
-    return Mesh(vertices, faces.astype(np.int32), values["normals"], values["color"], values["opacity"])
+    faces = vertex_of.reshape(-1, 3).astype(np.int32)
+    mesh = Mesh(points[source], faces, values["normals"], values["color"], values["opacity"], name=told["name"])
+    return placed(mesh, arrays["matrix"])
 
 
-def _fan(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Divide polygons into fans; return each triangle's polygon and its three places in the list of corners."""
-    first = np.cumsum(counts) - counts
-    triangles = np.maximum(counts - 2, 0)
-    face_of = np.repeat(np.arange(len(counts)), triangles)
-    step = np.arange(len(face_of)) - np.repeat(np.cumsum(triangles) - triangles, triangles)
-    start = first[face_of]
-    return face_of, np.stack([start, start + step + 1, start + step + 2], axis=-1)
+def _with_looks(
+    key: str,
+    own: tuple[np.ndarray | None, str],
+    looks: list[dict[str, Any]],
+    arrays: dict[str, np.ndarray],
+    default: np.ndarray,
+) -> tuple[np.ndarray | None, str]:
+    """Return an attribute with what materials say in place of the mesh's own, and its interpolation."""
+    values, where = own
+    subsets = []
+    for look in looks:
+        if look[key] is None:
+            continue
+        if look["faces"] is None:
+            values, where = np.array([look[key]], dtype=np.float64), "constant"
+        else:
+            subsets.append((arrays[f"faces{look['faces']}"], look[key]))
+    if not subsets:
+        return values, where
+    counts, indices = arrays["counts"], arrays["indices"]
+    polygon = np.repeat(np.arange(len(counts)), counts)
+    if values is None:
+        spread = np.broadcast_to(default, (len(indices), *default.shape)).copy()
+    else:
+        place = {
+            "constant": np.zeros(len(indices), dtype=np.int64),
+            "uniform": polygon,
+            "faceVarying": np.arange(len(indices)),
+        }.get(where, indices)
+        spread = values[np.minimum(place, len(values) - 1)].copy()
+    for faces, value in subsets:
+        spread[np.isin(polygon, faces)] = value
+    return spread, "faceVarying"
 
 
 def _vertices(
@@ -152,39 +200,3 @@ def _vertices(
     _, first, vertex_of = np.unique(np.stack(keys, axis=-1), axis=0, return_index=True, return_inverse=True)
     result.update({name: values[first] for name, values in per_corner.items()})
     return point[first], vertex_of.reshape(-1), result
-
-
-def _primvar(primvar: Any, time: Any) -> tuple[np.ndarray | None, str]:
-    values = primvar.ComputeFlattened(time) if primvar and primvar.HasAuthoredValue() else None
-    if values is None or not len(values):
-        return None, "constant"
-    array = np.asarray(values, dtype=np.float64)
-    return (array, str(primvar.GetInterpolation())) if np.isfinite(array).all() else (None, "constant")
-
-
-def _normals(mesh: Any, time: Any) -> tuple[np.ndarray | None, str]:
-    from pxr import UsdGeom
-
-    primvar = UsdGeom.PrimvarsAPI(mesh.GetPrim()).GetPrimvar("normals")
-    values, where = _primvar(primvar, time)
-    if values is None:
-        given = mesh.GetNormalsAttr().Get(time)
-        values = np.asarray(given, dtype=np.float64) if given is not None and len(given) else None
-        where = str(mesh.GetNormalsInterpolation())
-    if values is None or values.ndim != 2 or where in ("uniform", "constant"):
-        # Face normals would only repeat what `normals = "flat"` computes.
-        return None, "constant"
-    return values, where
-
-
-def _preview_surface(prim: Any) -> tuple[np.ndarray | None, np.ndarray | None]:
-    from pxr import UsdShade
-
-    material = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0]
-    shader = material.ComputeSurfaceSource()[0] if material else None
-    found: list[np.ndarray | None] = []
-    for name in ("diffuseColor", "opacity"):
-        value = shader.GetInput(name) if shader else None
-        plain = value.Get() if value and not value.HasConnectedSource() else None
-        found.append(None if plain is None else np.asarray([plain], dtype=np.float64))
-    return found[0], found[1]

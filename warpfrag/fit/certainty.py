@@ -1,12 +1,12 @@
-"""What a method hands back, and what the Jacobian at its end tells about how well the parameters are known."""
+"""What the Jacobian at the end of a fit tells about how well the parameters are known."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from warpfrag.fit.jacobian import Compressed
-from warpfrag.fit.parameters import Variable, component_names
+from warpfrag.fit.compression import Compressed
+from warpfrag.fit.parameters import FittedParameter, component_names
 
 # The least that a reference's values scatter by: rounding of a few float32 operations.
 SMALLEST_NOISE = 1e-6
@@ -17,25 +17,6 @@ FLAT = 1e-6
 # an opacity or a colour is 1 and a thickness is a logarithm: the interval of ± 2 standard errors then covers that whole
 # range, or a factor of e.
 UNDETERMINED = 0.25
-
-
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """Where a method ended from one start.
-
-    Attributes:
-        coordinates: the best coordinates found.
-        loss: the loss there.
-        converged: whether the stopping rule ended the fit, not the number of steps.
-        reason: why it ended.
-        evaluations: times that the images were computed.
-    """
-
-    coordinates: np.ndarray
-    loss: float
-    converged: bool
-    reason: str
-    evaluations: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +36,7 @@ class Certainty:
 
 def assess(
     compressed: Compressed,
-    variables: Sequence[Variable],
+    fitted: Sequence[FittedParameter],
     residual_count: int,
     covered_count: int,
     covered_squares: float,
@@ -69,7 +50,7 @@ def assess(
 
     Args:
         compressed: residuals and Jacobian at the end, of the mean square.
-        variables: the parameters.
+        fitted: the parameters.
         residual_count: number of all residuals.
         covered_count: number of residuals in pixels that any object covers.
         covered_squares: sum of their squares.
@@ -89,6 +70,6 @@ def assess(
     errors = np.sqrt(variance) * np.linalg.norm(rows * inverse[:, None], axis=0) / scale
     involved = np.abs(rows[flat]).max(axis=0, initial=0.0) > 1e-3
     errors = np.where(involved | (norms == 0.0), np.inf, errors)
-    names = component_names(variables)
+    names = component_names(fitted)
     undetermined = tuple(name for name, error in zip(names, errors, strict=True) if not error <= UNDETERMINED)
     return Certainty(errors, condition, undetermined)

@@ -20,12 +20,12 @@ from typing import Any
 import numpy as np
 
 from warpfrag.extras import need
-from warpfrag.fit.certainty import Outcome
 from warpfrag.fit.maps import Smoothness, coarsen, level_of, refine
-from warpfrag.fit.parameters import placed
-from warpfrag.fit.problem import Problem
+from warpfrag.fit.parameters import with_places
+from warpfrag.fit.problem import Problem, describe_run
+from warpfrag.fit.result import Run
 from warpfrag.fit.session import FitError, Session, check_finite
-from warpfrag.fit.study import StudyError
+from warpfrag.fit.views import StudyError
 
 LBFGS_EVALUATIONS = 25
 # L-BFGS starts at least this share of the range inside the bounds, where the slope is not 0.
@@ -36,21 +36,21 @@ class _Coordinate:
     """One parameter's coordinates as a torch leaf, in the way a method moves them."""
 
     def __init__(self, problem: Problem, index: int, bent: bool) -> None:
-        self.variable, self.device = problem.study.variables[index], problem.processes.device
-        self.lower, self.upper = self.variable.span
+        self.fitted, self.device = problem.study.parameters[index], problem.processes.device
+        self.lower, self.upper = self.fitted.coordinate_bounds
         self.bent = bent and math.isfinite(self.lower)
         self.middle, self.half = 0.5 * (self.lower + self.upper), 0.5 * (self.upper - self.lower)
         self.smoothness: Smoothness | None = None
-        if self.variable.smoothness:
-            self.smoothness = Smoothness(self.variable, problem.study.fitted_scene, self.device)
+        if self.fitted.smoothness:
+            self.smoothness = Smoothness(self.fitted, problem.study.scene, self.device)
         self.leaf: Any = None
 
     def put(self, coordinate: np.ndarray, stage: int) -> None:
         """Make a new leaf for coordinates, on the grid of a stage."""
         import torch
 
-        whole = torch.tensor(coordinate.reshape(self.variable.start.shape), dtype=torch.float64, device=self.device)
-        leaf = coarsen(whole, level_of(self.variable, stage))
+        whole = torch.tensor(coordinate.reshape(self.fitted.start.shape), dtype=torch.float64, device=self.device)
+        leaf = coarsen(whole, level_of(self.fitted, stage))
         if self.bent:
             leaf = self.half * torch.asin(((leaf - self.middle) / self.half).clamp(INSIDE - 1.0, 1.0 - INSIDE))
         self.leaf = leaf.requires_grad_()
@@ -58,7 +58,7 @@ class _Coordinate:
     def coordinate(self) -> Any:
         """Return the coordinates, differentiable in the leaf."""
         inside = self.middle + self.half * (self.leaf / self.half).sin() if self.bent else self.leaf
-        return refine(inside, self.variable.start.shape) if self.variable.levels > 1 else inside
+        return refine(inside, self.fitted.start.shape) if self.fitted.levels > 1 else inside
 
     def project(self) -> None:
         """Put the leaf back between the bounds."""
@@ -114,13 +114,13 @@ class Descent(ABC):
         study = problem.study
         self.torch = torch = need("torch", "torch", "Adam and L-BFGS")
         try:
-            torch.zeros(1, device=study.device)
+            torch.zeros(1, device=study.asked.device)
         except (RuntimeError, AssertionError) as error:
             reason = str(error).splitlines()[0]
-            raise StudyError(f"device: found {study.device!r}, which torch cannot use ({reason})") from None
+            raise StudyError(f"device: got {study.asked.device!r}, which torch cannot use ({reason})") from None
         self.problem, self.session, self.study = problem, session, study
-        self.coordinates = [_Coordinate(problem, index, self.bent) for index in range(len(study.variables))]
-        self.stages = max(variable.levels for variable in study.variables)
+        self.coordinates = [_Coordinate(problem, index, self.bent) for index in range(len(study.parameters))]
+        self.stages = max(each.levels for each in study.parameters)
         # Where each start has come to.
         self.states: list[dict[str, Any]] = list(session.state.get("runs", []))
         self.index = -1
@@ -137,14 +137,14 @@ class Descent(ABC):
     def settled(self) -> str | None:
         """Return why the stage has come to its end, if it has."""
 
-    def run(self, start: np.ndarray) -> Outcome:
+    def run(self, start: np.ndarray) -> Run:
         """Fit from a start, or go on from where the checkpoint has come to from there."""
         self.index += 1
         with _one_torch_thread():
             return self._run(start)
 
-    def _run(self, start: np.ndarray) -> Outcome:
-        steps = int(self.study.steps or 0)
+    def _run(self, start: np.ndarray) -> Run:
+        steps = self.study.steps
         self.begin(start)
         if self.index < len(self.states):
             self._restore(self.states[self.index])
@@ -168,12 +168,21 @@ class Descent(ABC):
         self.session.state = self._state()
         self.states = self.session.state["runs"]
         course = self.course
-        return Outcome(course.best, course.best_loss, converged, reason, course.evaluations)
+        return describe_run(
+            self.problem,
+            start,
+            course.best,
+            loss=course.best_loss,
+            losses=self.session.losses[course.begin :],
+            evaluations=course.evaluations,
+            converged=converged,
+            reason=reason,
+        )
 
     def begin(self, start: np.ndarray) -> None:
         """Begin the course from a start, in the first stage."""
         self.course = _Course(len(self.session.losses), start)
-        self._enter(0, start, int(self.study.steps or 0) // self.stages)
+        self._enter(0, start, self.study.steps // self.stages)
 
     @property
     def done(self) -> int:
@@ -189,9 +198,9 @@ class Descent(ABC):
         torch, step = self.torch, len(self.session.losses) + 1
         for coordinate in self.coordinates:
             coordinate.leaf.grad = None
-        outward, priors = self._values_and_priors()
+        whole, priors = self._values_and_priors()
         # Leaves of their own, so that each view's graph is gone before the next is made.
-        leaves = {name: tensor.detach().requires_grad_() for name, tensor in outward.items()}
+        leaves = {name: tensor.detach().requires_grad_() for name, tensor in whole.items()}
         values = {name: leaf.detach().cpu().numpy() for name, leaf in leaves.items()}
         total = 0.0
         for index in self.problem.processes.share(views):
@@ -208,9 +217,7 @@ class Descent(ABC):
         gradients = [torch.zeros_like(x) if x.grad is None else x.grad for x in leaves.values()]
         total, gradients = self._over_processes(total, gradients)
         check_finite(step, total, values, {n: g.cpu().numpy() for n, g in zip(leaves, gradients, strict=True)})
-        torch.autograd.backward(
-            [*outward.values(), *priors], [*gradients, *(torch.ones_like(prior) for prior in priors)]
-        )
+        torch.autograd.backward([*whole.values(), *priors], [*gradients, *(torch.ones_like(prior) for prior in priors)])
         self.course.evaluations += 1
         return total + sum(float(prior.detach()) for prior in priors)
 
@@ -227,17 +234,17 @@ class Descent(ABC):
     def full_loss(self) -> float:
         """Return the loss of all views, prior included, without a gradient."""
         with self.torch.no_grad():
-            outward, priors = self._values_and_priors()
+            values, priors = self._values_and_priors()
             mine = self.problem.processes.share(list(range(len(self.problem.views))))
             views = [self.problem.views[index] for index in mine]
-            total = sum(float(view.loss(view.image(outward))) for view in views) / len(self.problem.views)
+            total = sum(float(view.loss(view.image(values))) for view in views) / len(self.problem.views)
         return float(self.problem.processes.sum(np.array([total]))[0]) + sum(float(prior) for prior in priors)
 
     def _values_and_priors(self) -> tuple[dict[str, Any], list[Any]]:
         """Return the parameters by name, and the priors of those that have one, differentiable in the leaves."""
-        inward = [(coordinate, coordinate.coordinate()) for coordinate in self.coordinates]
-        values = {each.variable.name: each.variable.outward(tensor) for each, tensor in inward}
-        return values, [each.smoothness(tensor) for each, tensor in inward if each.smoothness]
+        moved = [(coordinate, coordinate.coordinate()) for coordinate in self.coordinates]
+        values = {each.fitted.name: each.fitted.to_value(tensor) for each, tensor in moved}
+        return values, [each.smoothness(tensor) for each, tensor in moved if each.smoothness]
 
     def vector(self) -> np.ndarray:
         """Return all coordinates as one vector."""
@@ -259,7 +266,7 @@ class Descent(ABC):
     def _enter(self, stage: int, vector: np.ndarray, end: int) -> None:
         """Begin a stage from a vector of coordinates."""
         self.course.stage, self.course.stage_end, self.course.scores = stage, end, []
-        for coordinate, (_, place) in zip(self.coordinates, placed(self.study.variables), strict=True):
+        for coordinate, (_, place) in zip(self.coordinates, with_places(self.study.parameters), strict=True):
             coordinate.put(vector[place], stage)
         self.torch_optimizer = self.optimizer()
 
@@ -293,42 +300,42 @@ class Adam(Descent):
 
     def optimizer(self) -> Any:
         """Return a new optimiser of the leaves."""
-        rate = self.study.learning_rate
-        groups = [{"params": [c.leaf], "lr": c.variable.learning_rate or rate} for c in self.coordinates]
+        rate = self.study.asked.learning_rate
+        groups = [{"params": [c.leaf], "lr": c.fitted.learning_rate or rate} for c in self.coordinates]
         return self.torch.optim.Adam(groups)
 
     def step(self) -> float:
         """Take one step and return the loss before it, of its batch."""
         loss = self.evaluate(self._batch())
-        if self.study.batch is None:
+        if self.study.asked.batch is None:
             self.keep(loss)
         self.torch_optimizer.step()
         return loss
 
     def settled(self) -> str | None:
         """Return why the stage has come to its end, if it has."""
-        patience = -(-int(self.study.patience or 1) // self._round)
+        patience = -(-self.study.patience // self._round)
         if len(self.course.scores) <= patience:
             return None
         best, before = min(self.course.scores[-patience:]), min(self.course.scores[:-patience])
-        stalled = best >= (1.0 - self.study.tolerance) * before
+        stalled = best >= (1.0 - self.study.asked.tolerance) * before
         return f"{self.study.patience} steps brought nothing better" if stalled else None
 
     @property
     def _round(self) -> int:
         """Steps in which all views have their turn."""
-        return -(-len(self.problem.views) // (self.study.batch or len(self.problem.views)))
+        return -(-len(self.problem.views) // (self.study.asked.batch or len(self.problem.views)))
 
     def _batch(self) -> list[int]:
         count = len(self.problem.views)
-        if self.study.batch is None:
+        if self.study.asked.batch is None:
             return list(range(count))
         turn, place = divmod(self.done, self._round)
-        order = np.random.default_rng([self.study.seed, turn]).permutation(count)
-        return sorted(order[place * self.study.batch : (place + 1) * self.study.batch].tolist())
+        order = np.random.default_rng([self.study.asked.seed, turn]).permutation(count)
+        return sorted(order[place * self.study.asked.batch : (place + 1) * self.study.asked.batch].tolist())
 
     def _score(self, loss: float) -> None:
-        if self.study.batch is None:
+        if self.study.asked.batch is None:
             self.course.scores.append(loss)
         # The step at hand is not yet in the history.
         elif (self.done + 1) % self._round == 0 or self.done + 1 == self.study.steps:
@@ -362,11 +369,11 @@ class LBFGS(Descent):
 
     def settled(self) -> str | None:
         """Return why the stage has come to its end, if it has."""
-        patience = int(self.study.patience or 1)
+        patience = self.study.patience
         if len(self.course.scores) <= patience:
             return None
         recent = self.course.scores[-patience - 1 :]
-        same = all(abs(a - b) <= self.study.tolerance * abs(a) for a, b in pairwise(recent))
+        same = all(abs(a - b) <= self.study.asked.tolerance * abs(a) for a, b in pairwise(recent))
         return "the loss stopped changing" if same else None
 
     def _closure(self) -> float:

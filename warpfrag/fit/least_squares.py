@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from warpfrag.extras import need
-from warpfrag.fit.certainty import Outcome
 from warpfrag.fit.jacobian import Evaluation
-from warpfrag.fit.problem import Problem
+from warpfrag.fit.problem import Problem, describe_run
+from warpfrag.fit.result import Run
 from warpfrag.fit.session import FitError, Session, check_finite
 
 # Images are made from float32 values: a relative change below their spacing is none.
@@ -52,9 +52,9 @@ class LeastSquares:
                 keys[i]: j for i, j in zip(state["jacobian_of"].tolist(), state["jacobians"], strict=True)
             }
 
-    def run(self, start: np.ndarray) -> Outcome:
+    def run(self, start: np.ndarray) -> Run:
         """Fit from a start."""
-        study = self.problem.study
+        study, begin = self.problem.study, len(self.session.losses)
         lower, upper = self.problem.bounds()
         # SciPy moves a start on a bound into the inside by itself.
         found = self.optimize.least_squares(
@@ -64,14 +64,22 @@ class LeastSquares:
             bounds=(lower, upper),
             method="trf",
             x_scale="jac",
-            ftol=study.tolerance if study.tolerance > EPSILON else None,
-            xtol=max(study.tolerance, SMALLEST_STEP),
+            ftol=study.asked.tolerance if study.asked.tolerance > EPSILON else None,
+            xtol=max(study.asked.tolerance, SMALLEST_STEP),
             gtol=EPSILON,
             max_nfev=study.steps,
         )
         self.session.state = self._state()
-        loss = self.costs[found.x.tobytes()] * self.loss.factor
-        return Outcome(found.x, loss, found.status > 0, _REASONS[found.status], found.nfev)
+        return describe_run(
+            self.problem,
+            start,
+            found.x,
+            loss=self.costs[found.x.tobytes()] * self.loss.factor,
+            losses=self.session.losses[begin:],
+            evaluations=found.nfev,
+            converged=found.status > 0,
+            reason=_REASONS[found.status],
+        )
 
     def _state(self) -> dict[str, Any]:
         """Return everything as arrays."""
@@ -117,7 +125,7 @@ class LeastSquares:
         if key not in self.jacobians:
             step, values = len(self.session.losses), self.problem.values(coordinates)
             found = self._checked(step, values, lambda: self._evaluate(coordinates).compress())
-            names = [v.name for v in self.problem.study.variables for _ in range(v.start.size)]
+            names = [each.name for each in self.problem.study.parameters for _ in range(each.start.size)]
             columns = dict(zip(names, np.abs(found.jacobian).max(axis=0), strict=True))
             check_finite(step, found.cost * self.loss.factor, values, columns)
             self.jacobians[key] = found.jacobian

@@ -21,7 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from warpfrag.errors import shorten
+from warpfrag.arrays.kinds import NUMPY, kind_of
+from warpfrag.errors import check_number, check_whole, shorten
 
 ROBUST = ("l2", "l1", "huber")
 LOSSES = (*ROBUST, "ssim")
@@ -86,7 +87,8 @@ class ImageLoss:
         """Return a loss by name, or the weighted sum of several.
 
         Raises:
-            ValueError: an unknown name, a weight that is not above 0, or scales that are no whole number from 1.
+            ValueError: an unknown name, a weight that is not above 0, or scales below 1.
+            TypeError: a weight that is no number, or scales that are no whole number.
 
         Example:
             >>> ImageLoss.of({"l1": 0.8, "ssim": 0.2}, delta=0.1, scales=3).robust is None
@@ -96,15 +98,12 @@ class ImageLoss:
         names = ", ".join(f'"{name}"' for name in LOSSES)
         expected = f"one of {names}, or some of them with weights"
         if not weights:
-            raise ValueError(f"loss: found no names, expected {expected}")
+            raise ValueError(f"loss: got no names, expected {expected}")
         for name, weight in weights.items():
             if name not in LOSSES:
-                raise ValueError(f"loss: found {shorten(name)}, expected {expected}")
-            number = isinstance(weight, (int, float)) and not isinstance(weight, bool)
-            if not number or not 0.0 < weight < math.inf:
-                raise ValueError(f"loss.{name}: found {shorten(weight)}, expected a weight above 0")
-        if isinstance(scales, bool) or not isinstance(scales, int) or scales < 1:
-            raise ValueError(f"scales: found {shorten(scales)}, expected a whole number from 1")
+                raise ValueError(f"loss: got {shorten(name)}, expected {expected}")
+            check_number(f"loss.{name}", weight, above=0.0)
+        check_whole("scales", scales, 1)
         return ImageLoss(tuple((name, float(weight)) for name, weight in weights.items()), delta, scales)
 
     @property
@@ -121,7 +120,7 @@ class ImageLoss:
             reference: a tensor of the same shape.
         """
         if image.shape != reference.shape:
-            raise ValueError(f"image: found shape {tuple(image.shape)}, expected {tuple(reference.shape)}")
+            raise ValueError(f"image: got shape {tuple(image.shape)}, expected {tuple(reference.shape)}")
         levels = zip(pyramid(image.double(), self.scales), pyramid(reference.double(), self.scales), strict=True)
         losses = [self._at_one_scale(*level) for level in levels]
         return sum(losses[1:], losses[0]) / len(losses)
@@ -165,12 +164,7 @@ def halve(image: Any) -> Any:
     Returns:
         An image of (⌈H/2⌉, ⌈W/2⌉, …), alike to the bit for arrays and tensors.
     """
-    if isinstance(image, np.ndarray):
-        concatenate = np.concatenate
-    else:
-        import torch
-
-        concatenate = torch.concatenate
+    concatenate = (kind_of(image) or NUMPY).xp.concatenate
     height, width = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
     rows = 0.5 * (image[0:height:2] + image[1:height:2])
     if height < image.shape[0]:
@@ -229,8 +223,8 @@ def psnr(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = Non
         ValueError: the images have different sizes.
     """
     if image.shape[:2] != reference.shape[:2]:
-        found, expected = (f"{shape[1]} × {shape[0]}" for shape in (image.shape, reference.shape))
-        raise ValueError(f"image: found {found} pixels, expected {expected} like the reference")
+        got, expected = (f"{shape[1]} × {shape[0]}" for shape in (image.shape, reference.shape))
+        raise ValueError(f"image: got {got} pixels, expected {expected} like the reference")
     error = np.asarray(image[..., :3], np.float64) - np.asarray(reference[..., :3], np.float64)
     mean_square = float(np.mean(np.square(error if mask is None else error[mask])))
     return -10.0 * math.log10(mean_square) if mean_square > 0.0 else math.inf

@@ -4,13 +4,14 @@ from typing import Any
 
 import numpy as np
 
-from warpfrag.fit.parameters import Variable
+from warpfrag.fit.parameters import FittedParameter
+from warpfrag.scene.parameters import VERTICES
 from warpfrag.scene.scene import Scene
 
 
-def level_of(variable: Variable, stage: int) -> int:
+def level_of(fitted: FittedParameter, stage: int) -> int:
     """Return how many times a map's grid is halved in a stage: one time less in each, then not any more."""
-    return max(0, variable.levels - 1 - stage)
+    return max(0, fitted.levels - 1 - stage)
 
 
 def coarsen(grid: Any, level: int) -> Any:
@@ -43,21 +44,21 @@ class Smoothness:
     start that is to be alike.
 
     Args:
-        variable: the parameter, per pixel or vertex.
+        fitted: the parameter, per pixel or vertex.
         scene: the scene, whose faces tell neighbours.
         device: where torch computes.
     """
 
-    def __init__(self, variable: Variable, scene: Scene, device: str) -> None:
+    def __init__(self, fitted: FittedParameter, scene: Scene, device: str) -> None:
         import torch
 
-        self.variable = variable
+        self.fitted = fitted
         self.edges: Any = None
-        if variable.per == "vertex":
-            faces = next(item for item in scene.objects if item.name == variable.owner).faces
+        if fitted.per == "vertex":
+            faces = next(item for item in scene.objects if item.name == fitted.owner).faces
             pairs = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
             self.edges = torch.as_tensor(np.unique(pairs, axis=0).astype(np.int64), device=device)
-        start = variable.inward(variable.start) if variable.key == "vertices" else 0.0
+        start = fitted.to_coordinate(fitted.start) if fitted.kind is VERTICES else 0.0
         self.origin = torch.as_tensor(start, dtype=torch.float64, device=device)
 
     def __call__(self, coordinate: Any) -> Any:
@@ -69,4 +70,4 @@ class Smoothness:
             differences = [moved[..., 1:, :] - moved[..., :-1, :], moved[..., :, 1:] - moved[..., :, :-1]]
         count = sum(part.numel() for part in differences)
         total = sum(part.square().sum() for part in differences)
-        return self.variable.smoothness * total / max(1, count)
+        return self.fitted.smoothness * total / max(1, count)

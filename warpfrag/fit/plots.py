@@ -1,21 +1,19 @@
 """The plots of a fit: where the image is wrong, before and after, and how the loss fell."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from warpfrag.extras import need
 from warpfrag.files.saving import replacing
-
-if TYPE_CHECKING:
-    from warpfrag.fit.result import FitResult, ViewResult
+from warpfrag.fit.result import FitResult, ViewResult
 
 _DPI = 150
 _STYLE = {"font.size": 9.0, "axes.titlesize": 10.0, "axes.linewidth": 0.6, "figure.dpi": _DPI, "savefig.dpi": _DPI}
 
 
-def draw_error(view: "ViewResult", path: Path) -> None:
+def draw_error(view: ViewResult, path: Path) -> None:
     """Draw the absolute error of each pixel, its largest over the channels, at the start and at the end.
 
     Args:
@@ -52,7 +50,7 @@ def draw_error(view: "ViewResult", path: Path) -> None:
         _save(figure, path)
 
 
-def draw_loss(result: "FitResult", path: Path) -> None:
+def draw_loss(result: FitResult, path: Path) -> None:
     """Draw the loss over the steps, on a logarithmic scale, with the best so far.
 
     Args:

@@ -3,23 +3,26 @@
 While nothing moves, what each pixel sees stays: a view is captured once, and only shaded and composited in each step.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from warpfrag.arrays.legacy import kind_of
+from warpfrag.arrays.kinds import NUMPY, kind_of
 from warpfrag.capture.bounded import capture_kbuffer
 from warpfrag.capture.coverage import Coverage
 from warpfrag.composite import composite
-from warpfrag.fit.parameters import in_multiples_of_p, placed
+from warpfrag.fit.parameters import with_places
 from warpfrag.fit.processes import Processes
+from warpfrag.fit.result import Run, plain_value
 from warpfrag.fit.scaled_fragments import UnitFragments
-from warpfrag.fit.study import RENDER_OPTIONS, Study, View, true_of_view
+from warpfrag.fit.study import PreparedStudy, Study
+from warpfrag.fit.views import Resolve, View
 from warpfrag.fragments import Fragments
 from warpfrag.render import over_background, render
+from warpfrag.scene.parameters import BETA
 from warpfrag.scene.scene import Scene
 from warpfrag.storage.kbuffer import kbuffer
 
@@ -37,22 +40,23 @@ class ViewProblem:
         device: where to compute.
     """
 
-    def __init__(self, study: Study, view: View, index: int, device: str) -> None:
+    def __init__(self, study: PreparedStudy, view: View, index: int, device: str) -> None:
         self.study, self.view, self.index, self.device = study, view, index, device
-        self.scene = replace(study.fitted_scene, camera=view.camera)
-        self.moves = any(variable.moves for variable in study.variables)
+        self.scene = replace(study.scene, camera=view.camera)
+        self.resolve: Resolve = study.asked.resolve
+        self.has_motion = any(each.is_motion for each in study.parameters)
         self.reference = reference_image(study, view, index)
         self.channels = self.reference.shape[2]
 
     @cached_property
     def coverage(self) -> Coverage:
         """What each pixel sees, where nothing moves."""
-        return Coverage.of(self.scene, sort=self.study.resolve == "sorted")
+        return Coverage.of(self.scene, sort=self.resolve == "sorted")
 
     @cached_property
     def unit(self) -> UnitFragments:
         """The fragments as functions of few values per object, where nothing moves."""
-        return UnitFragments(self.scene, self.coverage, self.study.variables)
+        return UnitFragments(self.scene, self.coverage, self.study.parameters)
 
     @cached_property
     def fragments(self) -> Fragments:
@@ -61,23 +65,23 @@ class ViewProblem:
 
     def parameters(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Return this view's part of parameter values, in single precision."""
-        return {v.name: _single(v.in_view(values[v.name], self.index)) for v in self.study.variables}
+        return {each.name: _single(each.of_view(values[each.name], self.index)) for each in self.study.parameters}
 
     def image(self, values: Mapping[str, Any]) -> Any:
         """Return the image for parameter values, (H, W, 4) float32; torch tensors get their gradient."""
         parameters = self.parameters(values)
-        if self.moves:
-            return render_scene(self.scene, self.study.resolve, parameters)
-        beta = parameters.pop("beta", float(self.scene.beta))
+        if self.has_motion:
+            return render_scene(self.scene, self.resolve, parameters)
+        beta = parameters.pop(BETA.key, float(self.scene.beta))
         fragments = self.coverage.shade(parameters) if parameters else self.fragments
-        if kind_of(beta) == "torch" and kind_of(fragments.rgba) == "numpy":
+        if kind_of(beta) not in (None, NUMPY) and kind_of(fragments.rgba) is NUMPY:
             fragments = fragments.torch(beta.device)
         return self.over_background(self.composite(fragments, beta))
 
     def composite(self, fragments: Fragments, beta: Any) -> Any:
         """Composite fragments as the scene says, without its background."""
         scene = self.scene
-        if self.study.resolve == "kbuffer":
+        if self.resolve == "kbuffer":
             return composite(kbuffer(fragments, scene.layers, merge=scene.merge))  # type: ignore[arg-type]
         return composite(fragments, beta, max_layers=scene.layers, merge=scene.merge, mix=scene.mix)
 
@@ -87,11 +91,15 @@ class ViewProblem:
 
     def residual(self, image: Any) -> Any:
         """Return image minus reference, (H, W, C), an array or a tensor."""
-        return image[..., : self.channels] - _like(self.reference, image)
+        return image[..., : self.channels] - self._reference_like(image)
 
     def loss(self, image: Any) -> Any:
         """Return the study's loss of a torch image, a 0-d float64 tensor."""
-        return self.study.image_loss(image[..., : self.channels], _like(self.reference, image))
+        return self.study.image_loss(image[..., : self.channels], self._reference_like(image))
+
+    def _reference_like(self, image: Any) -> Any:
+        kind = kind_of(image) or NUMPY
+        return kind.asarray(self.reference, kind.astype(image, "float32"))
 
 
 class Problem:
@@ -103,26 +111,26 @@ class Problem:
     """
 
     def __init__(self, study: Study, processes: Processes | None = None) -> None:
-        self.study, self.processes = study, processes or Processes(study.device)
-        fitted = study.fitted_views
+        self.study, self.processes = study.prepared, processes or Processes(study.device)
         device = self.processes.device
-        self.views = [ViewProblem(study, view, index, device) for index, view in enumerate(fitted)]
-        self.held_out = [ViewProblem(study, view, 0, device) for view in study.all_views if view.held_out]
+        fitted = enumerate(self.study.fitted_views)
+        self.views = [ViewProblem(self.study, view, index, device) for index, view in fitted]
+        self.held_out = [ViewProblem(self.study, view, 0, device) for view in self.study.held_out_views]
 
     def values(self, coordinates: np.ndarray) -> dict[str, np.ndarray]:
         """Return the parameters for a vector of a method's coordinates."""
         return {
-            variable.name: np.asarray(variable.outward(coordinates[place].reshape(variable.start.shape)))
-            for variable, place in placed(self.study.variables)
+            each.name: np.asarray(each.to_value(coordinates[place].reshape(each.start.shape)))
+            for each, place in with_places(self.study.parameters)
         }
 
     def start(self) -> np.ndarray:
         """Return the start as a vector of a method's coordinates, float64."""
-        return np.concatenate([variable.inward(variable.start).reshape(-1) for variable in self.study.variables])
+        return np.concatenate([each.to_coordinate(each.start).reshape(-1) for each in self.study.parameters])
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the bounds of the vector."""
-        spans = [np.tile(variable.span, (variable.start.size, 1)) for variable in self.study.variables]
+        spans = [np.tile(each.coordinate_bounds, (each.start.size, 1)) for each in self.study.parameters]
         lower, upper = np.concatenate(spans).T
         return lower, upper
 
@@ -131,34 +139,47 @@ class Problem:
 
         What is fitted per vertex, pixel or view starts from one value everywhere; what has no bounds from the study's.
         """
-        generator = np.random.default_rng(self.study.seed)
+        generator = np.random.default_rng(self.study.asked.seed)
         lower, upper = self.bounds()
         starts = [np.clip(self.start(), lower, upper)]
-        for _ in range(self.study.restarts):
+        for _ in range(self.study.asked.restarts):
             parts = []
-            for variable in self.study.variables:
-                low, high = variable.span
-                one = (3,) if variable.key == "color" or variable.moves else ()
-                share = generator.uniform(_MARGIN, 1.0 - _MARGIN, one)
-                start = variable.inward(variable.start) if np.isinf(low) else low + share * (high - low)
-                parts.append(np.broadcast_to(start, variable.start.shape).reshape(-1))
+            for each in self.study.parameters:
+                low, high = each.coordinate_bounds
+                share = generator.uniform(_MARGIN, 1.0 - _MARGIN, each.kind.value_shape)
+                start = each.to_coordinate(each.start) if np.isinf(low) else low + share * (high - low)
+                parts.append(np.broadcast_to(start, each.start.shape).reshape(-1))
             starts.append(np.concatenate(parts))
         return starts
 
 
-def _like(array: np.ndarray, image: Any) -> Any:
-    if kind_of(image) != "torch":
-        return array
-    import torch
+def describe_run(
+    problem: Problem, start: np.ndarray, end: np.ndarray, *, losses: Sequence[float], **outcome: Any
+) -> Run:
+    """Return what a method did from a start, given in its coordinates as its end is.
 
-    return torch.as_tensor(array, device=image.device)
+    Args:
+        problem: what was fitted.
+        start: where it began.
+        end: where the loss was least.
+        losses: the loss of each step.
+        outcome: the other fields of `Run`.
+    """
+    return Run(
+        start={name: plain_value(value) for name, value in problem.values(start).items()},
+        found={name: plain_value(value) for name, value in problem.values(end).items()},
+        coordinates=end,
+        losses=tuple(losses),
+        **outcome,
+    )
 
 
 def _single(value: Any) -> Any:
-    return value.float() if kind_of(value) == "torch" else np.asarray(value, np.float32)
+    kind = kind_of(value)
+    return np.asarray(value, np.float32) if kind is None else kind.astype(value, "float32")
 
 
-def render_scene(scene: Scene, resolve: str, parameters: Mapping[str, Any]) -> Any:
+def render_scene(scene: Scene, resolve: Resolve, parameters: Mapping[str, Any]) -> Any:
     """Render a scene as `Study.resolve` says."""
     if resolve == "sorted":
         return render(scene, parameters=parameters)
@@ -166,7 +187,7 @@ def render_scene(scene: Scene, resolve: str, parameters: Mapping[str, Any]) -> A
     return over_background(composite(layers), scene.background)
 
 
-def reference_image(study: Study, view: View, index: int = 0) -> np.ndarray:
+def reference_image(study: PreparedStudy, view: View, index: int = 0) -> np.ndarray:
     """Return the image that a view approaches, (H, W, 3 or 4) float32.
 
     Args:
@@ -174,18 +195,16 @@ def reference_image(study: Study, view: View, index: int = 0) -> np.ndarray:
         view: the view.
         index: its place among the fitted views.
     """
-    reference, scene = view.reference, replace(study.scene, camera=view.camera)
+    reference, scene = view.reference, replace(study.asked.scene, camera=view.camera)
     assert reference is not None
     height, width = view.camera.shape
     if reference.image is not None:
         image = np.asarray(reference.image, np.float32)
         return over_background(image, scene.background) if image.shape[2] == 4 else image
     samples = reference.supersampling
-    own = {key: getattr(reference, key) for key in RENDER_OPTIONS}
-    options = {key: value for key, value in own.items() if value is not None}
-    fine = replace(scene, camera=view.camera.resized((width * samples, height * samples)), **options)
-    fine, true = in_multiples_of_p(fine, true_of_view(reference, index, len(study.fitted_views)), "reference.true")
-    image = np.asarray(render_scene(fine, study.resolve, true))
+    fine = replace(scene, camera=view.camera.resized((width * samples, height * samples)), **reference.render_options)
+    fine, true = fine.in_units_of(reference.of_view(index, len(study.fitted_views)), "reference.true")
+    image = np.asarray(render_scene(fine, study.asked.resolve, true))
     if samples > 1:
         image = image.reshape(height, samples, width, samples, 4).mean(axis=(1, 3), dtype=np.float64)
     return np.ascontiguousarray(image, np.float32)

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from warpfrag.fit.parameters import values_words
+from warpfrag.fit.parameters import values_wording
 from warpfrag.fit.session import Progress
 
 # More parameters than this do not fit on a line.
@@ -36,7 +36,7 @@ def progress_bar(name: str) -> Iterator[Any]:
         def get_renderables(self) -> Iterable[RenderableType]:
             yield self.make_tasks_table(self.tasks)
             for task in self.tasks:
-                yield Text(task.fields["words"], overflow="ellipsis", no_wrap=True)
+                yield Text(task.fields["wording"], overflow="ellipsis", no_wrap=True)
 
     console = Console(stderr=True)
     if not console.is_terminal:
@@ -44,10 +44,10 @@ def progress_bar(name: str) -> Iterator[Any]:
         return
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with TwoLines(*columns, console=console) as bar:
-        task = bar.add_task(name, total=None, words="preparing")
+        task = bar.add_task(name, total=None, wording="preparing")
 
         def show(progress: Progress) -> None:
-            bar.update(task, completed=progress.step, total=progress.steps or None, words=_words(progress))
+            bar.update(task, completed=progress.step, total=progress.steps or None, wording=_wording(progress))
 
         try:
             yield show
@@ -66,13 +66,13 @@ def _lines(name: str) -> Any:
         nonlocal told
         if time.monotonic() - told >= _SECONDS_PER_LINE:
             told = time.monotonic()
-            print(f"{name}: step {progress.step}/{progress.steps}, {_words(progress)}", file=sys.stderr, flush=True)
+            print(f"{name}: step {progress.step}/{progress.steps}, {_wording(progress)}", file=sys.stderr, flush=True)
 
     return show
 
 
-def _words(progress: Progress) -> str:
+def _wording(progress: Progress) -> str:
     if progress.message:
         return progress.message
     shown = dict(list(progress.parameters.items())[:_MOST_SHOWN])
-    return f"loss {progress.loss:.3g}, {values_words(shown)}"
+    return f"loss {progress.loss:.3g}, {values_wording(shown)}"

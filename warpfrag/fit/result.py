@@ -1,22 +1,12 @@
-"""What a fit found, and the folder it is saved in."""
+"""What a fit found."""
 
-import json
-import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from warpfrag.files.images import write_image
-from warpfrag.files.saving import replacing
 from warpfrag.fit.losses import psnr
-from warpfrag.fit.parameters import value_words
-from warpfrag.versions import package_versions
-
-# Arrays with more numbers than this are written beside result.json, not into it.
-MOST_NUMBERS = 256
+from warpfrag.fit.parameters import value_wording
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +40,7 @@ class Run:
     Attributes:
         start: parameters at the start, by name: floats and float64 arrays.
         found: parameters of the least loss.
+        coordinates: the same as a vector of what methods move.
         loss: the least loss.
         losses: the loss of each step.
         evaluations: times that the images were computed.
@@ -59,6 +50,7 @@ class Run:
 
     start: dict[str, Any] = field(repr=False)
     found: dict[str, Any]
+    coordinates: np.ndarray = field(repr=False)
     loss: float
     losses: tuple[float, ...] = field(repr=False)
     evaluations: int
@@ -141,11 +133,11 @@ class FitResult:
         errors = self.relative_errors()
         lines = []
         for name, found in self.found.items():
-            line = f"{name}: {value_words(self.start[name])} → {value_words(found)}"
+            line = f"{name}: {value_wording(self.start[name])} → {value_wording(found)}"
             if self.standard_errors is not None and np.size(found) == 1:
                 line += f" ± {float(self.standard_errors[name]):.2g}"
             if self.true is not None and errors is not None:
-                line += f" (true {value_words(self.true[name])}, off by {100.0 * errors[name]:.3g} %)"
+                line += f" (true {value_wording(self.true[name])}, off by {100.0 * errors[name]:.3g} %)"
             if any(part == name or part.startswith(f"{name}[") for part in self.undetermined):
                 line += " — not determined by this image"
             lines.append(line)
@@ -159,94 +151,8 @@ class FitResult:
             end += f", condition number {self.condition_number:.3g}"
         return [*lines, end]
 
-    def to_json(self, arrays: dict[str, np.ndarray] | None = None) -> dict[str, Any]:
-        """Return everything but the images as plain values; large arrays go to `arrays`, if it is given."""
-        return {
-            "start": _plain_values("start", self.start, arrays),
-            "found": _plain_values("found", self.found, arrays),
-            "true": _plain_values("true", self.true, arrays),
-            "relative_errors": _plain(self.relative_errors()),
-            "standard_errors": _plain_values("standard_errors", self.standard_errors, arrays),
-            "condition_number": _plain(self.condition_number),
-            "undetermined": list(self.undetermined),
-            "loss": _plain(self.loss),
-            "losses": _plain(list(self.losses)),
-            "steps": self.steps,
-            "evaluations": self.evaluations,
-            "seconds": self.seconds,
-            "converged": self.converged,
-            "reason": self.reason,
-            "views": [_plain({"name": v.name, "held_out": v.held_out, "psnr": v.psnr}) for v in self.views],
-            "runs": [self._run_to_json(index, run, arrays) for index, run in enumerate(self.runs)],
-            **_plain(self.setting),
-            "versions": package_versions(),
-        }
-
-    @staticmethod
-    def _run_to_json(index: int, run: Run, arrays: dict[str, np.ndarray] | None) -> dict[str, Any]:
-        return {
-            "start": _plain_values(f"runs.{index}.start", run.start, arrays),
-            "found": _plain_values(f"runs.{index}.found", run.found, arrays),
-            "loss": _plain(run.loss),
-            "steps": len(run.losses),
-            "evaluations": run.evaluations,
-            "converged": run.converged,
-            "reason": run.reason,
-        }
-
-    def save(self, folder: str | Path) -> None:
-        """Write images, plots and result.json to a folder, made if need be; the images of several views to one each.
-
-        Raises:
-            ImageError: a file cannot be written.
-            ImportError: matplotlib is not installed.
-        """
-        from warpfrag.fit.plots import draw_error, draw_loss
-
-        folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        for view in self.views:
-            place = folder / view.name if len(self.views) > 1 else folder
-            place.mkdir(exist_ok=True)
-            for name in ("reference", "before", "after"):
-                write_image(place / f"{name}.png", getattr(view, name))
-            draw_error(view, place / "error.png")
-        draw_loss(self, folder / "loss.png")
-        arrays: dict[str, np.ndarray] = {}
-        content = self.to_json(arrays)
-        if arrays:
-            with replacing(folder / "parameters.npz") as partial:
-                np.savez(partial, **arrays)  # type: ignore[arg-type]
-        with replacing(folder / "result.json") as partial:
-            partial.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-
 
 def plain_value(value: Any) -> Any:
     """Return a parameter as a float, or as a float64 array."""
     array = np.array(value, dtype=np.float64)
     return float(array) if array.ndim == 0 else array
-
-
-def _plain_values(kind: str, values: Mapping[str, Any] | None, arrays: dict[str, np.ndarray] | None) -> Any:
-    if values is None:
-        return None
-    result = {}
-    for name, value in values.items():
-        array = np.asarray(value)
-        if arrays is not None and array.size > MOST_NUMBERS:
-            arrays[f"{kind}.{name}"] = array
-            result[name] = {"shape": list(array.shape), "mean": _plain(float(array.mean())), "file": "parameters.npz"}
-        else:
-            result[name] = _plain(array.tolist())
-    return result
-
-
-def _plain(value: Any) -> Any:
-    """Return a value as JSON takes it: what is not finite becomes null."""
-    if isinstance(value, Mapping):
-        return {key: _plain(inner) for key, inner in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(inner) for inner in value]
-    if isinstance(value, (float, np.floating)):
-        return float(value) if math.isfinite(value) else None
-    return value

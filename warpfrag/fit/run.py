@@ -11,13 +11,22 @@ import numpy as np
 
 from warpfrag.extras import need
 from warpfrag.files.saving import remove_partial
-from warpfrag.fit.parameters import placed
+from warpfrag.fit.certainty import assess
+from warpfrag.fit.descent import LBFGS, Adam
+from warpfrag.fit.jacobian import Evaluation
+from warpfrag.fit.least_squares import LeastSquares
+from warpfrag.fit.losses import RobustLoss
+from warpfrag.fit.parameters import with_places
+from warpfrag.fit.problem import Problem
 from warpfrag.fit.processes import is_first_process
 from warpfrag.fit.progress import progress_bar
-from warpfrag.fit.result import FitResult, Run, ViewResult, plain_value
+from warpfrag.fit.result import FitResult, ViewResult, plain_value
+from warpfrag.fit.saving import save_result
 from warpfrag.fit.session import CHECKPOINT, FitError, Progress, Session, fingerprint
-from warpfrag.fit.study import Study
+from warpfrag.fit.study import PreparedStudy, Study
 from warpfrag.fit.study_file import load_study
+
+METHODS: dict[str, Any] = {"least_squares": LeastSquares, "adam": Adam, "lbfgs": LBFGS}
 
 
 def fit(
@@ -63,7 +72,7 @@ def fit(
         raise FitError("resume: got it without output, expected the folder with the checkpoint")
     if resume and not (Path(str(output)) / CHECKPOINT).is_file():
         path = Path(str(output)) / CHECKPOINT
-        raise FitError(f"{path}: found no checkpoint to resume, expected one; start without resume")
+        raise FitError(f"{path}: got no checkpoint to resume, expected one; start without resume")
     if output is not None:
         # What will be needed at the end is asked for at the beginning.
         need("matplotlib", "fit", "The report of a fit")
@@ -75,17 +84,14 @@ def fit(
     with progress_bar(study.name) if progress is True and first else nullcontext(progress or None) as report:
         result = _run(study, resume, output, report if callable(report) and first else None)
     if output is not None and first:
-        result.save(output)
+        save_result(result, output)
     return result
 
 
 def _run(study: Study, resume: bool, output: Path | None, report: Callable[[Progress], None] | None) -> FitResult:
-    from warpfrag.fit.descent import LBFGS, Adam
-    from warpfrag.fit.least_squares import LeastSquares
-    from warpfrag.fit.problem import Problem
-
     started = time.monotonic()
     problem = Problem(study)
+    prepared = problem.study
     digest = fingerprint(study, [view.reference for view in problem.views])
     folder = output if is_first_process() else None
     session = Session(study, digest, folder, report, started, problem.processes)
@@ -93,101 +99,78 @@ def _run(study: Study, resume: bool, output: Path | None, report: Callable[[Prog
         assert output is not None
         session.load(output)
     before = _images(problem, problem.values(problem.start()))
-    methods: dict[str, Any] = {"least_squares": LeastSquares, "adam": Adam, "lbfgs": LBFGS}
-    runs, outcomes = [], []
     with session.interruptible():
-        method = methods[str(study.method)](problem, session)
-        for start in problem.starts():
-            begin = len(session.losses)
-            outcome = method.run(start)
-            outcomes.append(outcome)
-            runs.append(_describe(problem, start, outcome, tuple(session.losses[begin:])))
+        method = METHODS[prepared.method](problem, session)
+        runs = [method.run(start) for start in problem.starts()]
         session.save()
-    best = min(range(len(runs)), key=lambda index: outcomes[index].loss)
-    found = problem.values(outcomes[best].coordinates)
-    errors, condition, undetermined = _certainty(problem, outcomes[best].coordinates, found)
+    best = min(runs, key=lambda run: run.loss)
+    found = problem.values(best.coordinates)
+    errors, condition, undetermined = _certainty(problem, best.coordinates, found)
     after = _images(problem, found)
     views = [
         ViewResult(view.view.name, view.view.held_out, view.reference, *images)
         for view, *images in zip([*problem.views, *problem.held_out], before, after, strict=True)
     ]
-    true = study.true
+    true = prepared.true
     return FitResult(
-        start={variable.name: plain_value(variable.start) for variable in study.variables},
-        found={name: plain_value(value) for name, value in found.items()},
+        start={each.name: plain_value(each.start) for each in prepared.parameters},
+        found=best.found,
         true=None if true is None else {name: plain_value(value) for name, value in true.items()},
         standard_errors=errors,
         condition_number=condition,
         undetermined=undetermined,
-        loss=outcomes[best].loss,
-        losses=runs[best].losses,
-        evaluations=sum(outcome.evaluations for outcome in outcomes),
+        loss=best.loss,
+        losses=best.losses,
+        evaluations=sum(run.evaluations for run in runs),
         seconds=session.seconds,
-        converged=outcomes[best].converged,
-        reason=outcomes[best].reason,
+        converged=best.converged,
+        reason=best.reason,
         views=tuple(views),
         runs=tuple(runs),
-        setting=_setting(study, problem.processes.count),
+        setting=_setting(prepared, problem.processes.count),
     )
 
 
-def _images(problem: Any, values: dict[str, Any]) -> list[np.ndarray]:
+def _images(problem: Problem, values: dict[str, Any]) -> list[np.ndarray]:
     return [np.asarray(view.image(values)) for view in (*problem.views, *problem.held_out)]
 
 
-def _describe(problem: Any, start: np.ndarray, outcome: Any, losses: tuple[float, ...]) -> Run:
-    begin, end = problem.values(start), problem.values(outcome.coordinates)
-    return Run(
-        start={name: plain_value(value) for name, value in begin.items()},
-        found={name: plain_value(value) for name, value in end.items()},
-        loss=outcome.loss,
-        losses=losses,
-        evaluations=outcome.evaluations,
-        converged=outcome.converged,
-        reason=outcome.reason,
-    )
-
-
 def _certainty(
-    problem: Any, coordinates: np.ndarray, found: dict[str, Any]
+    problem: Problem, coordinates: np.ndarray, found: dict[str, Any]
 ) -> tuple[dict[str, Any] | None, float | None, tuple[str, ...]]:
     """Return standard errors, condition number and what is undetermined; nothing where some parameter is not global."""
-    from warpfrag.fit.certainty import assess
-    from warpfrag.fit.jacobian import Evaluation
-    from warpfrag.fit.losses import RobustLoss
-
     study = problem.study
     if not study.is_global:
         return None, None, ()
     # Whatever the loss: how far images may differ by noise is a matter of squares, at the scale that has the noise.
-    evaluation = Evaluation(problem, RobustLoss.named("l2", study.delta), coordinates, scales=1)
+    evaluation = Evaluation(problem, RobustLoss.named("l2", study.asked.delta), coordinates, scales=1)
     residual_count = sum(view.reference.size for view in problem.views)
-    certainty = assess(evaluation.compress(), study.variables, residual_count, *evaluation.covered_residuals())
+    certainty = assess(evaluation.compress(), study.parameters, residual_count, *evaluation.covered_residuals())
     errors = {}
-    for variable, place in placed(study.variables):
-        error = certainty.standard_errors[place].reshape(variable.start.shape)
-        errors[variable.name] = plain_value(error * (found[variable.name] if variable.logarithm else variable.unit))
+    for each, place in with_places(study.parameters):
+        error = certainty.standard_errors[place].reshape(each.start.shape)
+        errors[each.name] = plain_value(error * (found[each.name] if each.is_logarithmic else each.unit))
     return errors, certainty.condition_number, certainty.undetermined
 
 
-def _setting(study: Study, processes: int) -> dict[str, Any]:
-    scene, loss = study.fitted_scene, study.loss
-    words = loss if isinstance(loss, str) else " + ".join(f"{weight:g} {name}" for name, weight in loss.items())
+def _setting(study: PreparedStudy, processes: int) -> dict[str, Any]:
+    asked, scene, loss = study.asked, study.scene, study.asked.loss
+    wording = loss if isinstance(loss, str) else " + ".join(f"{weight:g} {name}" for name, weight in loss.items())
     return {
-        "study": study.name,
+        "study": asked.name,
         "method": study.method,
-        "loss_name": words,
-        "scales": study.scales,
-        "size": list(study.all_views[0].camera.size),
-        "resolve": study.resolve,
+        "loss_name": wording,
+        "scales": asked.scales,
+        "size": list(study.views[0].camera.size),
+        "resolve": asked.resolve,
         "merge": scene.merge,
         "mix": scene.mix,
         "layers": scene.layers,
-        "tolerance": study.tolerance,
+        "tolerance": asked.tolerance,
         "patience": study.patience,
-        "batch": study.batch,
-        "seed": study.seed,
-        "restarts": study.restarts,
-        "device": study.device,
+        "batch": asked.batch,
+        "seed": asked.seed,
+        "restarts": asked.restarts,
+        "device": asked.device,
         "processes": processes,
     }

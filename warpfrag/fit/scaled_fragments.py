@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 
 from warpfrag.capture.coverage import Coverage
-from warpfrag.fit.parameters import Variable
+from warpfrag.fit.parameters import FittedParameter
 from warpfrag.fragments import Fragments
+from warpfrag.scene.parameters import COLOR, LOOK_COUNT, OPACITY, THICKNESS
 from warpfrag.scene.scene import Scene
 
 
@@ -23,48 +24,47 @@ class UnitFragments:
     Args:
         scene: the scene.
         coverage: what each pixel sees.
-        variables: the fitted parameters, all global.
+        fitted: the fitted parameters, all global.
         moved: values of those that move something.
     """
 
     def __init__(
-        self, scene: Scene, coverage: Coverage, variables: Sequence[Variable], moved: Mapping[str, Any] | None = None
+        self,
+        scene: Scene,
+        coverage: Coverage,
+        fitted: Sequence[FittedParameter],
+        moved: Mapping[str, Any] | None = None,
     ) -> None:
-        self.variables = variables
-        ones = {v.name: np.ones(v.start.shape, np.float32) for v in variables if v.key != "beta" and not v.moves}
+        self.fitted = [each for each in fitted if each.kind.look is not None]
+        ones = {each.name: np.ones(each.start.shape, np.float32) for each in self.fitted}
         # What the fragments were shaded with.
         self.parameters = {**ones, **(moved or {})}
         self.fragments: Fragments = coverage.shade(self.parameters).numpy()
         self.names = [item.name for item in scene.objects]
         self.objects = np.asarray(self.fragments.object_id)
 
-    def owned(self, name: str) -> list[int]:
+    def owned(self, each: FittedParameter) -> list[int]:
         """Return the objects that a parameter is a value of; one of the scene, of those without one of their own."""
-        owner, _, key = name.rpartition(".")
-        own = {v.owner for v in self.variables if v.key == key}
-        return [i for i, item in enumerate(self.names) if (item == owner if owner else item not in own)]
+        own = {other.owner for other in self.fitted if other.kind.look == each.kind.look}
+        return [i for i, item in enumerate(self.names) if (item == each.owner if each.owner else item not in own)]
 
-    def scales(self, values: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-        """Return each object's colour and opacity, (objects, 4), and thickness, (objects,); 1 where not fitted."""
-        rgba, thickness = np.ones((len(self.names), 4), np.float32), np.ones(len(self.names), np.float32)
-        for variable in self.variables:
-            owned, value = self.owned(variable.name), np.asarray(values.get(variable.name, 1.0))
-            if variable.key == "color":
-                rgba[owned, :3] = value
-            elif variable.key == "opacity":
-                rgba[owned, 3] = value
-            elif variable.key == "thickness":
-                thickness[owned] = value
-        return rgba, thickness
+    def scales(self, values: Mapping[str, Any]) -> np.ndarray:
+        """Return each object's colour, opacity and thickness, (objects, 5) float32; 1 where not fitted."""
+        scales = np.ones((len(self.names), LOOK_COUNT), np.float32)
+        for each in self.fitted:
+            scales[self.owned(each), each.kind.look] = np.asarray(values.get(each.name, 1.0))
+        return scales
 
-    def scaled(self, rgba: np.ndarray, thickness: np.ndarray) -> Fragments:
+    def scaled(self, scales: np.ndarray) -> Fragments:
         """Return the fragments for what `scales` gives."""
         unit = self.fragments
         # Mostly it is thicknesses that are fitted.
-        colors = unit.rgba if (rgba == 1.0).all() else unit.rgba * premultiplied(rgba)[self.objects]
-        return replace(unit, rgba=colors, thickness=unit.thickness * thickness[self.objects])
+        fixed = (scales[:, COLOR.look] == 1.0).all() and (scales[:, OPACITY.look] == 1.0).all()
+        colors = unit.rgba if fixed else unit.rgba * premultiplied(scales)[self.objects]
+        return replace(unit, rgba=colors, thickness=unit.thickness * scales[self.objects, THICKNESS.look][:, 0])
 
 
-def premultiplied(rgba: np.ndarray) -> np.ndarray:
-    """Return straight colours and opacities (N, 4) with the colours multiplied by the opacities."""
-    return np.concatenate([rgba[:, :3] * rgba[:, 3:], rgba[:, 3:]], axis=1)
+def premultiplied(scales: np.ndarray) -> np.ndarray:
+    """Return the factors of premultiplied colour and opacity, (objects, 4), for what `UnitFragments.scales` gives."""
+    color, opacity = scales[:, COLOR.look], scales[:, OPACITY.look]
+    return np.concatenate([color * opacity, opacity], axis=1)

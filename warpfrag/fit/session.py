@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 
 from warpfrag.files.saving import replacing
-from warpfrag.fit.parameters import values_words
+from warpfrag.fit.parameters import values_wording
 from warpfrag.fit.processes import Processes
-from warpfrag.fit.study import Study
+from warpfrag.fit.study import PreparedStudy, Study
 
 CHECKPOINT = "checkpoint.dat"
 # Of the file's layout; another one is not read.
@@ -74,7 +74,7 @@ class Session:
         started: float,
         processes: Processes | None = None,
     ) -> None:
-        self.study, self.fingerprint, self.folder = study, fingerprint, folder
+        self.study, self.fingerprint, self.folder = study.prepared, fingerprint, folder
         self.report, self.processes = report, processes
         self.losses: list[float] = []
         self.state: dict[str, Any] = {}
@@ -101,9 +101,9 @@ class Session:
             known = (int(saved.pop("version")), str(saved.pop("fingerprint"))) == (_VERSION, self.fingerprint)
             seconds = float(saved.pop("seconds"))
         except Exception as error:
-            raise FitError(f"{path}: found a checkpoint that cannot be read, expected {expected}") from error
+            raise FitError(f"{path}: got a checkpoint that cannot be read, expected {expected}") from error
         if not known:
-            raise FitError(f"{path}: found the checkpoint of another study, expected {expected}")
+            raise FitError(f"{path}: got the checkpoint of another study, expected {expected}")
         self.state, self.seconds_before = saved, seconds
 
     def save(self) -> None:
@@ -135,11 +135,11 @@ class Session:
         if self.processes is not None:
             # A wish to stop in one of them is one in all.
             self.interrupted = bool(self.processes.sum(np.array([float(self.interrupted)]))[0])
-        due = time.monotonic() - self.written >= self.study.checkpoint_seconds
+        due = time.monotonic() - self.written >= self.study.asked.checkpoint_seconds
         if self.folder is not None and (due or self.interrupted):
             self.state = state()
             self.save()
-        steps = int(self.study.steps or 0) * (1 + self.study.restarts)
+        steps = self.study.steps * (1 + self.study.asked.restarts)
         self.last = Progress(len(self.losses), steps, loss, dict(values))
         if self.report is not None:
             self.report(self.last)
@@ -169,14 +169,14 @@ class Session:
             signal.signal(signal.SIGINT, before)
 
 
-def _read(path: Path, study: Study) -> dict[str, Any]:
+def _read(path: Path, study: PreparedStudy) -> dict[str, Any]:
     # Neither of the two runs code that a file may hold.
     if study.method == "least_squares":
         with np.load(path, allow_pickle=False) as file:
             return dict(file)
     import torch
 
-    return torch.load(path, weights_only=True, map_location=study.device)
+    return torch.load(path, weights_only=True, map_location=study.asked.device)
 
 
 def check_finite(step: int, loss: float, values: Mapping[str, Any], gradients: Mapping[str, Any] | None = None) -> None:
@@ -190,7 +190,7 @@ def check_finite(step: int, loss: float, values: Mapping[str, Any], gradients: M
             if not np.isfinite(np.asarray(value, dtype=np.float64)).all():
                 raise FitError(f"step {step}: {kind}{name} is not finite (loss {loss:g})")
     if not np.isfinite(loss):
-        raise FitError(f"step {step}: the loss is {loss:g} at {values_words(values)}")
+        raise FitError(f"step {step}: the loss is {loss:g} at {values_wording(values)}")
 
 
 def fingerprint(study: Study, references: Sequence[np.ndarray]) -> str:
@@ -209,20 +209,21 @@ def fingerprint(study: Study, references: Sequence[np.ndarray]) -> str:
             if array:
                 digest.update(np.ascontiguousarray(thing).tobytes())
 
-    scene = study.fitted_scene
+    prepared = study.prepared
+    scene = prepared.scene
     add(scene.background, scene.beta, scene.layers, scene.merge, scene.mix, study.resolve)
-    add(*(view.camera for view in study.fitted_views), *references)
+    add(*(view.camera for view in prepared.fitted_views), *references)
     for item in scene.objects:
         add(item.name, item.thickness_unit, item.faces, item.matrix)
         for value in (item.vertices, item.color, item.opacity, item.thickness, item.uv, item.texture_index, item.shade):
             add(None if value is None else np.asarray(value))
         add(*item.textures)
-    for variable in study.variables:
-        add(variable.name, variable.start, variable.lower, variable.upper, variable.unit, variable.learning_rate)
-        add(variable.per, variable.smoothness, variable.levels)
-    add(study.image_loss, study.method, study.seed, study.restarts, study.learning_rate, study.tolerance, study.device)
-    add(study.patience, study.batch)
-    if study.batch is not None or any(variable.levels > 1 for variable in study.variables):
+    for each in prepared.parameters:
+        add(each.name, each.start, each.lower, each.upper, each.unit, each.learning_rate)
+        add(each.per, each.smoothness, each.levels)
+    add(prepared.image_loss, prepared.method, study.seed, study.restarts, study.learning_rate, study.tolerance)
+    add(study.device, prepared.patience, study.batch)
+    if study.batch is not None or any(each.levels > 1 for each in prepared.parameters):
         # How many steps there are then decides when the stages change, and when all views are looked at.
-        add(study.steps)
+        add(prepared.steps)
     return digest.hexdigest()

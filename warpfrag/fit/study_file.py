@@ -22,20 +22,23 @@ green.thickness = {start = "2P", per = "pixel", smoothness = 0.01, levels = 3}
 """
 
 import os
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
 
-from warpfrag.colors import parse_hex
 from warpfrag.errors import SceneError, shorten
 from warpfrag.files.images import ImageError, read_image
 from warpfrag.files.scene_file import CAMERA_KEYS, load_scene, read_camera, read_size
 from warpfrag.files.table import Table, is_number, is_numbers, read_toml
-from warpfrag.fit.parameters import PER, FitParameter, check_name, flatten_names
-from warpfrag.fit.study import RENDER_OPTIONS, Method, Reference, Resolve, Study, StudyError, View
-from warpfrag.scene.scene import MERGES, MIXES, Scene, multiple_of_p
+from warpfrag.fit.parameters import FitParameter, flatten_names
+from warpfrag.fit.study import Method, Study
+from warpfrag.fit.views import RENDER_OPTIONS, Reference, Resolve, StudyError, View
+from warpfrag.scene.names import MERGES, MIXES
+from warpfrag.scene.parameters import PER, Parameter, Thickness, check_name
+from warpfrag.scene.scene import Scene
 
 _INTEGERS = ("steps", "seed", "restarts", "scales", "patience", "batch")
 _NUMBERS = ("delta", "tolerance", "learning_rate", "checkpoint_seconds")
@@ -53,7 +56,7 @@ def load_study(path: str | os.PathLike, *, size: tuple[int, int] | None = None) 
         size: width and height in place of those in the files, of every view.
 
     Raises:
-        StudyError: anything in it that cannot be used: file, key, what was found, what is expected.
+        StudyError: anything in it that cannot be used: file, key, what was got, what is expected.
         SceneError: the same about the scene file.
         ImageError: a reference image cannot be read.
 
@@ -142,8 +145,8 @@ def _reference(top: Table, path: Path, scene: Scene) -> Reference:
     if table is None:
         raise top.error("reference", "none", "a table [reference] with image or true")
     if ("image" in table) == ("true" in table):
-        found = "both image and true" if "image" in table else "neither image nor true"
-        raise table.error("", found, "one of them")
+        got = "both image and true" if "image" in table else "neither image nor true"
+        raise table.error("", got, "one of them")
     options = _render_options(table)
     options["supersampling"] = table.integer("supersampling", 1, 64)
     options = {key: value for key, value in options.items() if value is not None}
@@ -155,24 +158,25 @@ def _reference(top: Table, path: Path, scene: Scene) -> Reference:
     if not isinstance(true, dict):
         raise table.error("true", shorten(true), "a table of parameter names and values")
     true = flatten_names(true, scene)
-    return Reference(true={name: _value(table, f"true.{name}", name, true[name]) for name in true}, **options)
+    known, values = scene.described(), {}
+    for name, value in true.items():
+        parameter = _parameter(name, known, table.file, "reference.true")
+        values[name] = _value(table, f"true.{name}", parameter, value)
+    return Reference(true=values, **options)
 
 
 def _parameters(top: Table, scene: Scene) -> dict[str, FitParameter]:
     table = top.data.get("parameters")
     if not isinstance(table, dict) or not table:
-        found = "none" if not table else shorten(table)
-        raise top.error("parameters", found, "a table [parameters] of names and start values")
-    result = {}
+        got = "none" if not table else shorten(table)
+        raise top.error("parameters", got, "a table [parameters] of names and start values")
+    known, result = scene.described(), {}
     for name, given in flatten_names(table, scene).items():
-        try:
-            check_name(name, scene, "parameters")
-        except ValueError as error:
-            raise SceneError(f"{top.file}: {error}") from None
+        parameter = _parameter(name, known, top.file, "parameters")
         if not isinstance(given, dict):
             given = {"start": given}
         entry = Table(given, top.file, f"parameters.{name}", _PARAMETER)
-        start = None if "start" not in entry else _value(entry, "start", name, given["start"])
+        start = None if "start" not in entry else _value(entry, "start", parameter, given["start"])
         lower, upper = entry.number("lower"), entry.number("upper")
         per: Any = entry.choice("per", PER)
         result[name] = FitParameter(
@@ -187,21 +191,25 @@ def _parameters(top: Table, scene: Scene) -> dict[str, FitParameter]:
     return result
 
 
-def _value(table: Table, key: str, name: str, value: Any) -> Any:
-    """Return a value from a file: a number, numbers, a colour "#rrggbb", or a thickness "2P"."""
-    kind = name.rpartition(".")[2]
+def _parameter(name: str, known: Mapping[str, Parameter], file: Any, where: str) -> Parameter:
+    try:
+        return check_name(name, known, where)
+    except ValueError as error:
+        raise SceneError(f"{file}: {error}") from None
+
+
+def _value(table: Table, key: str, parameter: Parameter, value: Any) -> Any:
+    """Return a value from a file: a number, numbers, a colour "#rrggbb", or a thickness "2P", which stays a text."""
+    kind = parameter.kind
     if isinstance(value, str):
-        color = parse_hex(value) if kind == "color" else None
-        if color is not None:
-            return list(color[:3])
-        if kind == "thickness" and multiple_of_p(value) is not None:
-            return value
-    if is_number(value) and kind != "color":
+        parsed = kind.parse(value)
+        if parsed is not None:
+            return value if isinstance(parsed, Thickness) else parsed
+    if is_number(value) and not kind.value_shape:
         return float(value)
     if isinstance(value, list) and _is_numeric(value):
         return np.asarray(value, dtype=np.float64)
-    expected = '3 numbers or "#rrggbb"' if kind == "color" else "a number"
-    raise table.error(key, shorten(value), expected)
+    raise table.error(key, shorten(value), kind.text)
 
 
 def _is_numeric(value: list) -> bool:

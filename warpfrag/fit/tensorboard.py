@@ -12,11 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from warpfrag.errors import check_whole
 from warpfrag.extras import need
 from warpfrag.fit.session import Progress
-
-# What is a map if it has two dimensions; colours and vertices have rows of three then.
-_ONE_NUMBER_EACH = ("beta", "thickness", "opacity")
+from warpfrag.scene.parameters import kind_named
 
 
 class TensorBoard:
@@ -46,10 +45,9 @@ class TensorBoard:
         self._module = need("torch.utils.tensorboard", "tensorboard", "Logging to TensorBoard")
         self.folder = Path(folder)
         if self.folder.exists() and not self.folder.is_dir():
-            raise ValueError(f"{self.folder}: found a file, expected a folder for the TensorBoard log")
+            raise ValueError(f"{self.folder}: got a file, expected a folder for the TensorBoard log")
         for name, value in (("image_steps", image_steps), ("most_scalars", most_scalars)):
-            if value < 1:
-                raise ValueError(f"{name}: found {value}, expected a whole number from 1")
+            check_whole(name, value, 1)
         self.image_steps, self.most_scalars = image_steps, most_scalars
         self._writer: Any = None
         self._last: Progress | None = None
@@ -100,7 +98,8 @@ class TensorBoard:
         self._images_at = progress.step
         for name, value in progress.parameters.items():
             array = np.asarray(value, dtype=np.float64)
-            if array.ndim != 2 or name.rpartition(".")[2] not in _ONE_NUMBER_EACH or array.size <= self.most_scalars:
+            # Colours and vertices have rows of three if they have two dimensions.
+            if array.ndim != 2 or kind_named(name).value_shape or array.size <= self.most_scalars:
                 continue
             low, high = float(array.min()), float(array.max())
             shown = (array - low) / (high - low) if high > low else np.zeros_like(array)

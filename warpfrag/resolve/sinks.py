@@ -12,7 +12,7 @@ from typing import Any
 import warp as wp
 
 from warpfrag.arrays.kinds import as_vectors
-from warpfrag.arrays.precisions import Array, Array2, Number, Precisions, Vector3, Vector4, in_precisions
+from warpfrag.arrays.precisions import Array, Array2, Number, Vector3, Vector4, in_precisions
 
 wp.set_module_options({"enable_backward": False})
 
@@ -32,7 +32,7 @@ class Sink:
     """
 
     name: str
-    arrays: Precisions
+    arrays: Any
     put: wp.Function
     finish: wp.Function
     cotangent: wp.Function

@@ -55,7 +55,7 @@ MIX_KINDS = {"opacity": MIX_OPACITY, "average": MIX_AVERAGE, "optical_depth": MI
 @kernels
 def resolve_fwd(number: Any, merge: int, mix: int, sink: Sink) -> Any:
     """Return the kernel that resolves pixels into a sink."""
-    slab, seen_type, put, finish = Slab[number], Seen[number], sink.put, sink.finish
+    slab, seen_type, out_type, put, finish = Slab[number], Seen[number], sink.arrays[number], sink.put, sink.finish
 
     def kernel(
         span: Span,
@@ -63,7 +63,7 @@ def resolve_fwd(number: Any, merge: int, mix: int, sink: Sink) -> Any:
         order: wp.array(dtype=int),
         length: int,
         invalid: wp.array2d(dtype=int),
-        out: sink.arrays[number],
+        out: out_type,
     ):
         """Resolve pixels.
 
@@ -146,13 +146,13 @@ def replay(lists: Any, pixel: int, merge: int, mix: int, scratch: Any, base: int
 @kernels
 def resolve_bwd(number: Any, merge: int, mix: int, sink: Sink) -> Any:
     """Return the kernel of the way back from a sink."""
-    slab, seen_type, cotangent = Slab[number], Seen[number], sink.cotangent
+    slab, seen_type, out_type, cotangent = Slab[number], Seen[number], sink.arrays[number], sink.cotangent
 
     def kernel(
         span: Span,
         lists: FragmentLists[number],
         scratch: Replay[number],
-        grad_out: sink.arrays[number],
+        grad_out: out_type,
         grads: FragmentGradients[number],
     ):
         """Take the gradient back through pixels.

@@ -1,30 +1,30 @@
 """A scene as flat arrays, ready for capture, with parameters put in the place of the scene's own values.
 
-Differentiable, with torch overrides: world vertices in ``"<name>.vertices"``, ``"<name>.translation"`` and
-``"<name>.rotation"``, colour, opacity and thickness in theirs. Frozen: faces, transforms, the point about which an
-object turns, textures and the baked Lambert factors (they stay those of the loaded mesh when vertices, objects or the
-camera move). What captures the geometry holds coverage fixed as well: a gradient in vertices or poses moves depths and
-attributes inside outlines, not the outlines.
+Differentiable, with torch overrides: world vertices in `"<name>.vertices"`, `"<name>.translation"` and
+`"<name>.rotation"`, colour, opacity and thickness in theirs. Frozen: faces, transforms, the point about which an object
+turns, textures and baked factors of the colours. What captures the geometry holds coverage fixed as well: a gradient in
+vertices or poses moves depths and attributes inside outlines, not the outlines.
+
+Coordinates are computed in float64 from the object's own vertices, its matrix and its pose, component by component:
+NumPy and torch round alike, and no matrix product is left to what autocast makes of it.
 """
 
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
-from warpfrag.errors import shorten, suggest
+from warpfrag.arrays.kinds import NUMPY, Kind, dtype_name, kind_of
+from warpfrag.errors import shorten
 from warpfrag.scene.camera import Camera
-from warpfrag.scene.pose import CAMERA, POSE_KEYS, move_object
-from warpfrag.scene.scene import (
-    PARAMETER_KEYS,
-    Scene,
-    SceneObject,
-    check_common_thickness,
-    check_parameter,
-    check_pose,
-)
+from warpfrag.scene.names import CAMERA, POSE_KEYS
+from warpfrag.scene.parameters import COLOR, COMMON_THICKNESS, OPACITY, THICKNESS, VERTICES, Parameter, check_name
+from warpfrag.scene.pose import move_object
+from warpfrag.scene.scene import Scene
+from warpfrag.scene.surface import SceneObject
+
+Precision = Literal["float32", "float64"]
 
 
 @dataclass(frozen=True)
@@ -32,21 +32,22 @@ class Geometry:
     """All objects of a scene in one set of arrays.
 
     Attributes:
-        vertices: World space [scene units], (V, 3).
-        faces: Indices into ``vertices``, (N, 3) int32 NumPy; objects one after the other, in submission order.
-        rgba: Straight colour (shade included) and opacity, without textures, (V, 4).
-        thickness: z-thickness (V,), in scene units or multiples of P(z) as ``thickness_in_p`` says; 0 where there is a
+        vertices: world space [scene units], (V, 3) float64, whatever the precision of the image.
+        faces: indices into `vertices`, (N, 3) int32 NumPy; objects one after the other, in submission order.
+        rgba: straight colour (shade included) and opacity, without textures, (V, 4).
+        thickness: z-thickness (V,), in scene units or multiples of P(z) as `thickness_in_p` says; 0 where there is a
             map.
-        object_id: Object of each face, (N,) int32 NumPy.
-        first_face: First face of each object and the total, (objects + 1,) int32 NumPy; primitive = face −
+        object_id: object of each face, (N,) int32 NumPy.
+        first_face: first face of each object and the total, (objects + 1,) int32 NumPy; primitive = face −
             first_face[object].
-        uv: Texture coordinates (V, 2) float32 NumPy, v up, repeating; None when nothing is textured.
-        texture_id: Image of each face, (N,) int32 NumPy, −1 for none.
-        textures: Straight linear RGBA images (h, w, 4) float32 NumPy, row 0 at the top, multiplied with ``rgba``.
+        uv: texture coordinates (V, 2) float32 NumPy, v up, repeating; None when nothing is textured.
+        texture_id: image of each face, (N,) int32 NumPy, −1 for none.
+        textures: straight linear RGBA images (h, w, 4) float32 NumPy, row 0 at the top, multiplied with `rgba`.
         thickness_maps: z-thickness per pixel (H, W), by object index, for the objects that have a map.
-        thickness_in_p: Whether the thickness of each object is in multiples of P(z), (objects,) bool NumPy.
-        camera_pose: How the camera is moved: translation [scene units] and rotation vector [degrees] in its own axes,
-            (3,) each; None where it stays.
+        thickness_in_p: whether the thickness of each object is in multiples of P(z), (objects,) bool NumPy.
+        precision: of the image, and of `rgba`, `thickness` and the maps.
+        camera_pose: how the camera is moved: translation [scene units] and rotation vector [degrees] in its own axes,
+            (3,) float64 each; None where it stays.
     """
 
     vertices: Any
@@ -60,63 +61,116 @@ class Geometry:
     textures: list[np.ndarray]
     thickness_maps: dict[int, Any]
     thickness_in_p: np.ndarray
+    precision: Precision = "float32"
     camera_pose: tuple[Any, Any] | None = None
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What arrays a scene is assembled in.
+
+    Attributes:
+        kind: the kind of arrays.
+        precision: of all but coordinates.
+        like: an array of that kind and precision, on its device.
+    """
+
+    kind: Kind
+    precision: Precision
+    like: Any
+
+    @staticmethod
+    def of(overrides: Mapping[str, Any], known: Mapping[str, Parameter]) -> "Frame":
+        """Return the frame that a set of overrides asks for.
+
+        Raises:
+            TypeError: arrays of two libraries.
+            ValueError: arrays on different devices.
+        """
+        arrays, kinds, devices = {}, {}, {}
+        for name, value in overrides.items():
+            kind = kind_of(value)
+            if kind is not None and kind is not NUMPY:
+                arrays[name], kinds[kind.name], devices[str(kind.device_of(value))] = value, name, name
+        if len(kinds) > 1:
+            (kind_name, name), (other, other_name) = list(kinds.items())[:2]
+            raise TypeError(f"parameters: got {name} of {kind_name} and {other_name} of {other}, expected one library")
+        if len(devices) > 1:
+            (device, name), (other, other_name) = list(devices.items())[:2]
+            raise ValueError(f"parameters: got {name} on {device} and {other_name} on {other}, expected one device")
+        asking = [*arrays.values()]
+        # Vertices that an object keeps in float64 say where it stands (far away), and nothing of the image.
+        asking += [v for n, v in overrides.items() if isinstance(v, np.ndarray) and not known[n].keeps_float64]
+        precision: Precision = "float64" if any(dtype_name(value) == "float64" for value in asking) else "float32"
+        kind = kind_of(next(iter(arrays.values()))) if arrays else NUMPY
+        assert kind is not None
+        like = kind.astype(next(iter(arrays.values())), precision) if arrays else np.zeros(0, precision)
+        return Frame(kind, precision, like)
+
+    def array(self, value: Any) -> Any:
+        """Return a number or an array in this kind and precision."""
+        if self.kind.owns(value):
+            return self.kind.astype(value, self.precision)
+        return self.kind.asarray(np.asarray(value), self.like)
+
+    def double(self, value: Any) -> Any:
+        """Return a number or an array in this kind, in float64."""
+        if self.kind.owns(value):
+            return self.kind.astype(value, "float64")
+        return self.kind.asarray(np.asarray(value, np.float64), self.kind.astype(self.like, "float64"))
 
 
 def assemble(scene: Scene, parameters: Mapping[str, Any] | None = None, *, camera: Camera | None = None) -> Geometry:
     """Flatten a scene, with parameter overrides applied.
 
     Args:
-        scene: What to flatten.
-        parameters: Values by the names of ``scene.parameters()``: numbers, NumPy arrays or torch tensors. A thickness
-            is in the object's own unit; it may be one number, one per vertex, or an (H, W) map. ``"thickness"`` without
-            a name, one number or a map, is that of all objects without one of their own here. ``"beta"`` is let
-            through.
-        camera: Whose pixel grid thickness maps must have; default the scene's.
+        scene: what to flatten.
+        parameters: values by the names of `scene.parameters()`: numbers, NumPy arrays or torch tensors, or texts such
+            as "2P". A number is in the object's own unit; a thickness may be one number, one per vertex, or an (H, W)
+            map. `"thickness"` without a name, one number or a map, is that of all objects without one of their own
+            here. `"beta"` is let through.
+        camera: whose pixel grid thickness maps must have; default the scene's.
 
     Returns:
-        Float arrays as torch tensors, differentiable in the overrides, if any override is a tensor, else NumPy; float64
-        if any override is a float64 array or tensor, else float32.
+        Arrays as torch tensors, differentiable in the overrides, if any override is a tensor, else NumPy. The image is
+        float64 if any override is a float64 tensor or NumPy array, else float32; NumPy's vertices of an object that
+        keeps its own in float64 have no say in that.
 
     Raises:
-        ValueError: An unknown name, a wrong shape, a value out of range, or tensors on different devices.
-        TypeError: An override that is neither a number, a NumPy array nor a torch tensor.
+        ValueError: an unknown name, a wrong shape, a value out of range, or tensors on different devices.
+        TypeError: an override that is neither a number, a NumPy array, a torch tensor nor a text.
 
     Example:
         >>> assemble(scene, {"ball.opacity": 0.5}).rgba[0]
         array([0.8, 0.8, 0.8, 0.5], dtype=float32)
     """
     camera = camera or scene.camera
-    overrides = _checked(scene, parameters or {})
-    kind = _ArrayKind(overrides)
-    overrides = {name: kind.array(value) for name, value in overrides.items()}
-    if "thickness" in overrides:
-        check_common_thickness(overrides["thickness"], camera)
+    known = scene.described()
+    scene, overrides = _checked(scene, parameters or {}, known)
+    frame = Frame.of(overrides, known)
+    if COMMON_THICKNESS.key in overrides:
+        # One array for all: a map is then there once.
+        common = overrides[COMMON_THICKNESS.key] = frame.array(overrides[COMMON_THICKNESS.key])
+        known[COMMON_THICKNESS.key].check(common, camera.shape)
     vertices, rgba, thickness, faces, uv, texture_id = [], [], [], [], [], []
     textures: list[np.ndarray] = []
     thickness_maps: dict[int, Any] = {}
     first_vertex = 0
     textured = any(item.texture is not None for item in scene.objects)
+    xp = frame.kind.xp
     for index, item in enumerate(scene.objects):
-        values = {}
-        for key in PARAMETER_KEYS:
-            own = overrides.get("thickness", item.thickness) if key == "thickness" else getattr(item, key)
-            values[key] = kind.array(overrides.get(f"{item.name}.{key}", own))
-            check_parameter(item, key, values[key], camera)
+        values = _values(item, overrides, known, frame, camera)
         count = len(item.vertices)
-        rotation, shift = kind.array(item.matrix[:3, :3].T.copy()), kind.array(item.matrix[:3, 3].copy())
-        world = kind.xp.matmul(values["vertices"], rotation) + shift
-        pose = _pose(item.name, overrides, kind)
-        vertices.append(world if pose is None else move_object(world, item.middle(), *pose))
-        color = kind.xp.broadcast_to(values["color"], (count, 3))
+        vertices.append(world_vertices_of(values[VERTICES], item, _pose(item.name, overrides, known, frame), frame))
+        color = xp.broadcast_to(values[COLOR], (count, 3))
         if item.shade is not None:
-            color = color * kind.array(item.shade)[:, None]
-        opacity = kind.xp.broadcast_to(values["opacity"], (count,))
-        rgba.append(kind.xp.concatenate([color, opacity[:, None]], 1))
-        if _is_map(item, values["thickness"]):
-            thickness_maps[index] = values["thickness"]
-            values["thickness"] = kind.array(0.0)
-        thickness.append(kind.xp.broadcast_to(values["thickness"], (count,)))
+            color = color * frame.array(item.shade)[:, None]
+        opacity = xp.broadcast_to(values[OPACITY], (count,))
+        rgba.append(xp.concatenate([color, opacity[:, None]], 1))
+        if len(values[THICKNESS].shape) == 2:
+            thickness_maps[index] = values[THICKNESS]
+            values[THICKNESS] = frame.array(0.0)
+        thickness.append(xp.broadcast_to(values[THICKNESS], (count,)))
         faces.append(item.faces + np.int32(first_vertex))
         texture_id.append(_texture_ids(item, len(textures)))
         textures.extend(item.textures)
@@ -125,10 +179,10 @@ def assemble(scene: Scene, parameters: Mapping[str, Any] | None = None, *, camer
         first_vertex += count
     face_counts = [len(item.faces) for item in scene.objects]
     return Geometry(
-        vertices=kind.join(vertices, (0, 3)),
+        vertices=xp.concatenate([frame.double(np.zeros((0, 3))), *vertices]),
         faces=np.concatenate([np.zeros((0, 3), dtype=np.int32), *faces]),
-        rgba=kind.join(rgba, (0, 4)),
-        thickness=kind.join(thickness, (0,)),
+        rgba=xp.concatenate([frame.array(np.zeros((0, 4))), *rgba]),
+        thickness=xp.concatenate([frame.array(np.zeros(0)), *thickness]),
         object_id=np.repeat(np.arange(len(face_counts), dtype=np.int32), face_counts),
         first_face=np.concatenate([[0], np.cumsum(face_counts)]).astype(np.int32),
         uv=np.concatenate(uv) if textured else None,
@@ -136,54 +190,53 @@ def assemble(scene: Scene, parameters: Mapping[str, Any] | None = None, *, camer
         textures=textures,
         thickness_maps=thickness_maps,
         thickness_in_p=np.array([item.thickness_unit == "P" for item in scene.objects], dtype=bool),
-        camera_pose=_pose(CAMERA, overrides, kind),
+        precision=frame.precision,
+        camera_pose=_pose(CAMERA, overrides, known, frame),
     )
 
 
-class _ArrayKind:
-    """NumPy or torch, with the precision and device that a set of overrides asks for."""
+def world_vertices_of(own: Any, item: SceneObject, pose: tuple[Any, Any] | None, frame: Frame) -> Any:
+    """Return an object's vertices in world space, (V, 3) float64.
 
-    def __init__(self, overrides: Mapping[str, Any]) -> None:
-        tensors = {name: value for name, value in overrides.items() if _is_tensor(value)}
-        devices = {str(value.device): name for name, value in tensors.items()}
-        if len(devices) > 1:
-            (device, name), (other, other_name) = list(devices.items())[:2]
-            raise ValueError(f"parameters: found {name} on {device} and {other_name} on {other}, expected one device")
-        arrays = [value for value in overrides.values() if _is_tensor(value) or isinstance(value, np.ndarray)]
-        double = any(str(value.dtype).endswith("float64") for value in arrays)
-        self.device = next(iter(tensors.values())).device if tensors else None
-        self.xp: Any = sys.modules["torch"] if tensors else np
-        self.dtype = self.xp.float64 if double else self.xp.float32
-
-    def array(self, value: Any) -> Any:
-        if self.xp is np:
-            return np.asarray(value, dtype=self.dtype)
-        if _is_tensor(value):
-            return value.to(self.dtype)
-        return self.xp.asarray(np.asarray(value), dtype=self.dtype, device=self.device)
-
-    def join(self, parts: list[Any], empty_shape: tuple[int, ...]) -> Any:
-        return self.xp.concatenate([self.array(np.zeros(empty_shape)), *parts])
+    Args:
+        own: in its own space [scene units], (V, 3) float64.
+        item: the object.
+        pose: its translation and rotation vector, float64; None where it stays.
+        frame: the kind of all of them.
+    """
+    x, y, z = own[:, 0], own[:, 1], own[:, 2]
+    # Python's own floats: torch would turn NumPy's into arrays.
+    rows = [[float(value) for value in row] for row in item.matrix[:3]]
+    points = [row[0] * x + row[1] * y + row[2] * z + row[3] for row in rows]
+    return frame.kind.xp.stack(points if pose is None else move_object(points, item.middle(), *pose), 1)
 
 
-def _is_tensor(value: Any) -> bool:
-    torch = sys.modules.get("torch")
-    return torch is not None and isinstance(value, torch.Tensor)
+def _values(
+    item: SceneObject, overrides: Mapping[str, Any], known: Mapping[str, Parameter], frame: Frame, camera: Camera
+) -> dict[Any, Any]:
+    """Return an object's values by kind, checked: those given, or its own."""
+    values = {}
+    for kind in (THICKNESS, COLOR, OPACITY, VERTICES):
+        name = f"{item.name}.{kind.key}"
+        own = getattr(item, kind.key)
+        if kind is THICKNESS:
+            own = overrides.get(COMMON_THICKNESS.key, own)
+        given = overrides.get(name, own)
+        values[kind] = frame.double(given) if kind is VERTICES else frame.array(given)
+        known[name].check(values[kind], camera.shape)
+    return values
 
 
-def _is_map(item: SceneObject, thickness: Any) -> bool:
-    return len(thickness.shape) == 2
-
-
-def _pose(owner: str, overrides: Mapping[str, Any], kind: _ArrayKind) -> tuple[Any, Any] | None:
-    """Return the translation and rotation that overrides give an object or the camera, None without."""
+def _pose(
+    owner: str, overrides: Mapping[str, Any], known: Mapping[str, Parameter], frame: Frame
+) -> tuple[Any, Any] | None:
+    """Return the translation and rotation that overrides give an object or the camera, float64; None without."""
     names = [f"{owner}.{key}" for key in POSE_KEYS]
     if not any(name in overrides for name in names):
         return None
-    for name in names:
-        if name in overrides:
-            check_pose(name, overrides[name])
-    translation, rotation = (overrides.get(name, kind.array(np.zeros(3))) for name in names)
+    translation, rotation = (frame.double(overrides.get(name, np.zeros(3))) for name in names)
+    for name, value in zip(names, (translation, rotation), strict=True):
+        known[name].check(value)
     return translation, rotation
 
 
@@ -195,28 +248,33 @@ def _texture_ids(item: SceneObject, first: int) -> np.ndarray:
     return np.where(item.texture_index < 0, -1, item.texture_index + first).astype(np.int32)
 
 
-def _checked(scene: Scene, parameters: Mapping[str, Any]) -> dict[str, Any]:
+def _checked(
+    scene: Scene, parameters: Mapping[str, Any], known: Mapping[str, Parameter]
+) -> tuple[Scene, dict[str, Any]]:
+    """Return the overrides as arrays or plain numbers, and the scene in the units that texts among them say."""
     if not isinstance(parameters, Mapping):
-        raise TypeError(f"parameters: found {type(parameters).__name__}, expected a mapping from names to values")
-    known = scene.parameter_names()
-    checked = {}
-    for name, value in parameters.items():
-        if name not in known:
-            raise ValueError(f"parameters: found the unknown name {shorten(name)}; {suggest(str(name), known)}")
-        if _is_tensor(value):
-            if str(value.dtype) not in ("torch.float32", "torch.float64"):
-                raise ValueError(f"{name}: found a tensor of {value.dtype}, expected torch.float32 or torch.float64")
-            checked[name] = value
-            continue
-        if not isinstance(value, (bool, int, float, list, tuple, np.ndarray, np.number)) or isinstance(value, bool):
-            found = type(value).__module__ + "." + type(value).__name__
-            raise TypeError(f"{name}: found {found}, expected a number, a NumPy array or a torch tensor")
-        try:
-            array = np.asarray(value)
-        except ValueError:
-            array = np.asarray(None)
-        if array.dtype.kind not in "fiu":
-            raise ValueError(f"{name}: found {shorten(value)}, expected numbers")
-        # A plain number or list says nothing about precision; only an array of float64 asks for it.
-        checked[name] = value if isinstance(value, np.ndarray) else array.astype(np.float32)
-    return checked
+        raise TypeError(f"parameters: got {type(parameters).__name__}, expected a mapping from names to values")
+    for name in parameters:
+        check_name(name, known, "parameters")
+    scene, parameters = scene.in_units_of(parameters)
+    return scene, {name: _checked_array(name, value) for name, value in parameters.items()}
+
+
+def _checked_array(name: str, value: Any) -> Any:
+    kind = kind_of(value)
+    if kind is not None and kind is not NUMPY and kind.xp is not None:
+        if dtype_name(value) not in ("float32", "float64"):
+            expected = f"a {kind.type_name} of float32 or float64"
+            raise ValueError(f"{name}: got a {kind.type_name} of {dtype_name(value)}, expected {expected}")
+        return value
+    if isinstance(value, bool) or not isinstance(value, (int, float, list, tuple, np.ndarray, np.number)):
+        got = type(value).__module__ + "." + type(value).__name__
+        raise TypeError(f"{name}: got {got}, expected a number, a NumPy array or a torch tensor")
+    try:
+        array = np.asarray(value)
+    except ValueError:
+        array = np.asarray(None)
+    if array.dtype.kind not in "fiu":
+        raise ValueError(f"{name}: got {shorten(value)}, expected numbers")
+    # A plain number or list says nothing about precision: it stays Python's.
+    return value

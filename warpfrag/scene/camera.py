@@ -10,25 +10,26 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from warpfrag.errors import shorten
+from warpfrag.errors import check_number, is_whole, shorten
+from warpfrag.scene.rotation import rotation_matrix
 
 
 @dataclass(frozen=True)
 class Camera:
-    """Where the image is taken from; perspective (``fov``) or orthographic (``height``).
+    """Where the image is taken from; perspective (`fov`) or orthographic (`height`).
 
     Attributes:
-        eye: Position of the eye, world space [scene units].
-        target: A point the camera looks at; the middle of the image.
-        up: World direction that points up in the image; any length, not along the line of sight.
-        fov: Vertical opening angle [degrees], between 0 and 180; None for an orthographic camera.
-        height: Vertical extent of the image [scene units], above 0; None for a perspective camera.
-        near: Planar depth of the near plane [scene units], above 0.
-        far: Planar depth of the far plane [scene units], beyond ``near``.
-        size: Width and height of the image [pixels].
+        eye: position of the eye, world space [scene units].
+        target: a point the camera looks at; the middle of the image.
+        up: world direction that points up in the image; any length, not along the line of sight.
+        fov: vertical opening angle [degrees], between 0 and 180; None for an orthographic camera.
+        height: vertical extent of the image [scene units], above 0; None for a perspective camera.
+        near: planar depth of the near plane [scene units], above 0.
+        far: planar depth of the far plane [scene units], beyond `near`.
+        size: width and height of the image [pixels].
 
     Raises:
-        ValueError: A value out of its range, both or neither of ``fov`` and ``height``, eye at the target, up along the
+        ValueError: a value out of its range, both or neither of `fov` and `height`, eye at the target, up along the
             view.
 
     Example:
@@ -50,29 +51,29 @@ class Camera:
             object.__setattr__(self, key, _triple(key, getattr(self, key)))
         for key in ("fov", "height", "near", "far"):
             value = getattr(self, key)
-            object.__setattr__(self, key, None if value is None else _number(key, value))
+            object.__setattr__(self, key, None if value is None else check_number(f"camera.{key}", value))
         object.__setattr__(self, "size", _size(self.size))
         if (self.fov is None) == (self.height is None):
             found = "neither" if self.fov is None else "both"
             raise ValueError(
-                f"camera: found {found} of fov and height, expected fov (perspective) or height (orthographic)"
+                f"camera: got {found} of fov and height, expected fov (perspective) or height (orthographic)"
             )
         if self.fov is not None and not 0.0 < self.fov < 180.0:
-            raise ValueError(f"camera.fov: found {self.fov:g}, expected degrees between 0 and 180")
+            raise ValueError(f"camera.fov: got {self.fov:g}, expected degrees between 0 and 180")
         if self.height is not None and not self.height > 0.0:
-            raise ValueError(f"camera.height: found {self.height:g}, expected a number above 0")
+            raise ValueError(f"camera.height: got {self.height:g}, expected a number above 0")
         if not self.near > 0.0:
-            raise ValueError(f"camera.near: found {self.near:g}, expected a number above 0")
+            raise ValueError(f"camera.near: got {self.near:g}, expected a number above 0")
         if not self.far > self.near:
-            raise ValueError(f"camera.far: found {self.far:g}, expected a number above near ({self.near:g})")
+            raise ValueError(f"camera.far: got {self.far:g}, expected a number above near ({self.near:g})")
         forward = np.subtract(self.target, self.eye)
         if not np.any(forward):
-            raise ValueError(f"camera.target: found the eye itself ({list(self.eye)}), expected another point")
+            raise ValueError(f"camera.target: got the eye itself ({list(self.eye)}), expected another point")
         sine = np.linalg.norm(np.cross(_unit(forward), _unit(np.asarray(self.up)))) if any(self.up) else 0.0
         # Below this angle the image's own up direction is only rounding.
         if sine < 1e-9:
             raise ValueError(
-                f"camera.up: found {list(self.up)}, expected a direction that is not along the line of sight"
+                f"camera.up: got {list(self.up)}, expected a direction that is not along the line of sight"
             )
 
     @property
@@ -95,7 +96,7 @@ class Camera:
         """Focal length of a perspective camera [pixels].
 
         Raises:
-            ValueError: The camera is orthographic.
+            ValueError: the camera is orthographic.
         """
         if self.fov is None:
             raise ValueError("camera.focal: an orthographic camera has none, expected a camera with fov")
@@ -106,7 +107,7 @@ class Camera:
         """Edge of a pixel of an orthographic camera [scene units per pixel].
 
         Raises:
-            ValueError: The camera is perspective.
+            ValueError: the camera is perspective.
         """
         if self.height is None:
             raise ValueError("camera.pixel_size: a perspective camera has none, expected a camera with height")
@@ -126,6 +127,19 @@ class Camera:
         """Return this camera with another image size (width, height); the vertical field of view stays."""
         return replace(self, size=size)
 
+    def moved(self, translation: np.ndarray, rotation: np.ndarray) -> "Camera":
+        """Return this camera moved along its own axes (right, down, forward) and then turned about its eye.
+
+        Args:
+            translation: [scene units], (3,).
+            rotation: rotation vector [degrees], (3,).
+        """
+        axes = self.view_matrix()[:3, :3].T
+        _, down, forward = (axes @ rotation_matrix(rotation)).T
+        eye = self.eye + axes @ translation
+        target = eye + np.linalg.norm(np.subtract(self.target, self.eye)) * forward
+        return replace(self, eye=tuple(eye), target=tuple(target), up=tuple(-down))
+
 
 def _unit(vector: np.ndarray) -> np.ndarray:
     # Scaled by the largest component first, so that neither tiny nor huge vectors under- or overflow when squared.
@@ -133,26 +147,16 @@ def _unit(vector: np.ndarray) -> np.ndarray:
     return vector / np.linalg.norm(vector)
 
 
-def _number(key: str, value: object) -> float:
-    if (
-        isinstance(value, bool)
-        or not isinstance(value, (int, float, np.integer, np.floating))
-        or not math.isfinite(value)
-    ):
-        raise ValueError(f"camera.{key}: found {shorten(value)}, expected a finite number")
-    return float(value)
-
-
 def _triple(key: str, value: object) -> tuple[float, float, float]:
     if isinstance(value, (list, tuple, np.ndarray)) and len(value) == 3:
-        x, y, z = (_number(key, part) for part in value)
+        x, y, z = (check_number(f"camera.{key}", part) for part in value)
         return x, y, z
-    raise ValueError(f"camera.{key}: found {shorten(value)}, expected 3 numbers")
+    raise ValueError(f"camera.{key}: got {shorten(value)}, expected 3 numbers")
 
 
 def _size(value: object) -> tuple[int, int]:
     if isinstance(value, (list, tuple, np.ndarray)) and len(value) == 2:
-        parts = [int(part) for part in value if isinstance(part, (int, np.integer)) and not isinstance(part, bool)]
+        parts = [int(part) for part in value if is_whole(part)]
         if len(parts) == 2 and min(parts) >= 1:
             return parts[0], parts[1]
-    raise ValueError(f"camera.size: found {shorten(value)}, expected width and height, two whole numbers from 1")
+    raise ValueError(f"camera.size: got {shorten(value)}, expected width and height, two whole numbers from 1")

@@ -23,6 +23,7 @@ class Mesh:
         textures: straight linear RGBA images, (h, w, 4) float32, row 0 at the top.
         texture_index: (N,) int32, the image of each face, −1 for none; None where all faces have image 0 (or there is
             none).
+        name: what a file calls it; blank where it has no name.
     """
 
     vertices: np.ndarray
@@ -33,6 +34,29 @@ class Mesh:
     uv: np.ndarray | None = None
     textures: list[np.ndarray] = field(default_factory=list)
     texture_index: np.ndarray | None = None
+    name: str = ""
+
+
+def named(mesh: Mesh, name: str) -> Mesh:
+    """Return a mesh under a name."""
+    return replace(mesh, name=name)
+
+
+def placed(mesh: Mesh, matrix: np.ndarray) -> Mesh:
+    """Move a mesh by a matrix (4, 4); its outside stays outside, also where the matrix mirrors it."""
+    matrix = np.asarray(matrix, dtype=np.float64)
+    if np.array_equal(matrix, np.eye(4)):
+        return mesh
+    mirrors = np.linalg.det(matrix[:3, :3]) < 0.0
+    normals = None if mesh.normals is None else transformed_normals(mesh.normals, matrix)
+    if normals is not None and mirrors:
+        normals = -normals
+    return replace(
+        mesh,
+        vertices=mesh.vertices @ matrix[:3, :3].T + matrix[:3, 3],
+        faces=np.ascontiguousarray(mesh.faces[:, ::-1]) if mirrors else mesh.faces,
+        normals=normals,
+    )
 
 
 def join(parts: list[Mesh]) -> Mesh:
@@ -70,7 +94,7 @@ def join(parts: list[Mesh]) -> Mesh:
     if any(part.normals is not None for part in parts):
         own = [smooth_normals(part.vertices, part.faces) if part.normals is None else part.normals for part in parts]
         normals = np.concatenate(own)
-    if textures:
+    if textures or all(part.uv is not None for part in parts):
         blank = [np.zeros((n, 2), dtype=np.float32) for n in counts]
         uv = np.concatenate([zero if part.uv is None else part.uv for part, zero in zip(parts, blank, strict=True)])
     return Mesh(
@@ -89,22 +113,28 @@ def _known_color(part: Mesh) -> np.ndarray:
     return np.full(3, 1.0 if part.textures else GREY) if part.color is None else np.asarray(part.color)
 
 
-def split_faces(mesh: Mesh) -> Mesh:
-    """Give every face three vertices of its own (face-major), with flat normals."""
+def unshared(mesh: Mesh) -> Mesh:
+    """Give every face three vertices of its own, face-major; all else stays."""
     corner = mesh.faces.reshape(-1)
 
-    def pick(values):
-        return values[corner] if isinstance(values, np.ndarray) and len(values) == len(mesh.vertices) else values
+    def pick(values: Any) -> Any:
+        return values[corner] if np.ndim(values) and len(values) == len(mesh.vertices) else values
 
     return replace(
         mesh,
         vertices=mesh.vertices[corner],
         faces=np.arange(len(corner), dtype=np.int32).reshape(-1, 3),
-        normals=np.repeat(_unit_rows(_area_vectors(mesh.vertices, mesh.faces)), 3, axis=0),
+        normals=pick(mesh.normals),
         color=mesh.color if mesh.color is None or mesh.color.ndim == 1 else mesh.color[corner],
         opacity=pick(mesh.opacity),
         uv=pick(mesh.uv),
     )
+
+
+def split_faces(mesh: Mesh) -> Mesh:
+    """Give every face three vertices of its own (face-major), with flat normals."""
+    normals = np.repeat(_unit_rows(_area_vectors(mesh.vertices, mesh.faces)), 3, axis=0)
+    return replace(unshared(mesh), normals=normals)
 
 
 def weld(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -161,7 +161,7 @@ def _figure(path: Path, alt: str, caption: str) -> str:
     """Return a picture that fills the window when clicked; in elements that may stand in a paragraph."""
     kind = mimetypes.guess_type(path.name)[0] or ""
     if not path.is_file() or not kind.startswith("image/"):
-        raise SummaryError(f"{path}: found no such picture, expected one for the report")
+        raise SummaryError(f"{path}: got no such picture, expected one for the report")
     data = base64.b64encode(path.read_bytes()).decode("ascii")
     picture = f'<img src="data:{kind};base64,{data}" alt="{escape(alt)}">'
     zoom = f'<label><input type="checkbox" aria-label="enlarge">{picture}</label>'

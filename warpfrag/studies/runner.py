@@ -58,11 +58,11 @@ def find_studies(folder: str | os.PathLike = STUDIES) -> list[Path]:
     folder = Path(folder)
     if not folder.is_dir():
         raise StudiesError(
-            f"{folder}: found no such folder, expected one of studies: run it in a clone of the repository"
+            f"{folder}: got no such folder, expected one of studies: run it in a clone of the repository"
         )
     studies = sorted(script.parent for script in folder.glob(f"*/{SCRIPT}"))
     if not studies:
-        raise StudiesError(f"{folder}: found no study, expected folders with a {SCRIPT}")
+        raise StudiesError(f"{folder}: got no study, expected folders with a {SCRIPT}")
     return studies
 
 
@@ -112,7 +112,7 @@ def run_study(folder: Path, show: Callable[[str], None] | None = None) -> StudyR
     if status != 0:
         return StudyRun(folder, seconds, error=_reason(status, lines))
     if _state(results / SUMMARY) in (None, before):
-        return StudyRun(folder, seconds, error=f"found no new {results / SUMMARY}, expected {SCRIPT} to save a Summary")
+        return StudyRun(folder, seconds, error=f"got no new {results / SUMMARY}, expected {SCRIPT} to save a Summary")
     try:
         return StudyRun(folder, seconds, Summary.load(results / SUMMARY))
     except SummaryError as error:

@@ -61,7 +61,7 @@ class Table:
         object.__setattr__(self, "rows", rows)
         for number, row in enumerate(rows, start=1):
             if len(row) != len(columns):
-                raise SummaryError(f"table: found {len(row)} cells in row {number}, expected {len(columns)}")
+                raise SummaryError(f"table: got {len(row)} cells in row {number}, expected {len(columns)}")
 
     def markdown(self) -> str:
         """Return the table as Markdown, numbers to the right, its source aligned too."""
@@ -121,7 +121,7 @@ class Summary:
 
     def __post_init__(self):
         if not _NAME.fullmatch(self.name):
-            raise SummaryError(f'name: found {self.name!r}, expected letters, digits, "_" and "-"')
+            raise SummaryError(f'name: got {self.name!r}, expected letters, digits, "_" and "-"')
         object.__setattr__(self, "tables", tuple(self.tables))
         object.__setattr__(self, "figures", tuple(self.figures))
         object.__setattr__(self, "numbers", {name: _number(name, value) for name, value in self.numbers.items()})
@@ -154,7 +154,7 @@ class Summary:
         before, _, after = read_parts(folder)
         for figure in self.figures:
             if not (folder / figure.path).is_file():
-                raise SummaryError(f"{folder / figure.path}: found no such file, expected a figure the study has drawn")
+                raise SummaryError(f"{folder / figure.path}: got no such file, expected a figure the study has drawn")
         numbers = json.dumps(dict(sorted(self.numbers.items())), indent=2, ensure_ascii=False)
         target.mkdir(parents=True, exist_ok=True)
         # The first is renamed last: that it is new says that the others are.
@@ -178,9 +178,9 @@ class Summary:
         try:
             return msgspec.json.decode(Path(path).read_bytes(), type=cls)
         except OSError as error:
-            raise SummaryError(f"{path}: found no file that can be read, expected a study's {SUMMARY}") from error
+            raise SummaryError(f"{path}: got no file that can be read, expected a study's {SUMMARY}") from error
         except (msgspec.DecodeError, SummaryError) as error:
-            raise SummaryError(f"{path}: found no summary ({error}), expected one saved by a study") from error
+            raise SummaryError(f"{path}: got no summary ({error}), expected one saved by a study") from error
 
 
 def read_parts(folder: str | os.PathLike) -> tuple[str, str, str]:
@@ -193,15 +193,15 @@ def read_parts(folder: str | os.PathLike) -> tuple[str, str, str]:
     try:
         text = path.read_text(encoding="utf-8")
     except OSError as error:
-        raise SummaryError(f"{path}: found no file that can be read, expected the study's README") from error
+        raise SummaryError(f"{path}: got no file that can be read, expected the study's README") from error
     except UnicodeDecodeError as error:
-        raise SummaryError(f"{path}: found text that is not UTF-8, expected the study's README") from error
+        raise SummaryError(f"{path}: got text that is not UTF-8, expected the study's README") from error
     for marker in (BEGIN, END):
         if text.count(marker) != 1:
-            raise SummaryError(f'{path}: found "{marker}" {text.count(marker)} times, expected it once')
+            raise SummaryError(f'{path}: got "{marker}" {text.count(marker)} times, expected it once')
     before, rest = text.split(BEGIN)
     if END not in rest:
-        raise SummaryError(f'{path}: found "{END}" before "{BEGIN}", expected it after')
+        raise SummaryError(f'{path}: got "{END}" before "{BEGIN}", expected it after')
     results, after = rest.split(END)
     return before, results, after
 
@@ -209,9 +209,9 @@ def read_parts(folder: str | os.PathLike) -> tuple[str, str, str]:
 def _number(name: str, value: object) -> int | float:
     """Return a finite number as Python's own, a float rounded as far as it is written."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, float, np.integer, np.floating)):
-        raise SummaryError(f"{name}: found {value!r}, expected a number")
+        raise SummaryError(f"{name}: got {value!r}, expected a number")
     if not math.isfinite(value):
-        raise SummaryError(f"{name}: found {value}, expected a finite number")
+        raise SummaryError(f"{name}: got {value}, expected a finite number")
     return int(value) if isinstance(value, (int, np.integer)) else float(f"{value:.{DIGITS}g}")
 
 

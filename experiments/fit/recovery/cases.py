@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 import warpfrag as wf
-from warpfrag.fit.study import View
+from warpfrag.fit.views import View
 from warpfrag.shapes.mesh import Mesh, lambert, smooth_normals
 from warpfrag.shapes.primitives import sphere
 from warpfrag.shapes.surfels import PointSet, surfels

@@ -78,7 +78,7 @@ class FrozenView(ViewProblem):
         """Return the image for parameter values; torch tensors get their gradient."""
         parameters = self.parameters(values)
         if isinstance(parameters["beta"], np.ndarray):
-            fragments = self.unit.scaled(*self.unit.scales(parameters))
+            fragments = self.unit.scaled(self.unit.scales(parameters))
         else:
             import torch
 
@@ -132,7 +132,7 @@ class Setting:
         self.thinnest, self.thickest = (share * case.depth for share in THICKNESSES)
         self.residual_count = 4 * size * size * len(self.views)
         study = self.study(dict.fromkeys(self.names, 0.5), [np.zeros((size, size, 4), np.float32)] * len(self.views))
-        self.frozen = [FrozenView(study, view, index, study.device) for index, view in enumerate(study.all_views)]
+        self.frozen = [FrozenView(study, view, index, study.device) for index, view in enumerate(study.prepared.views)]
 
     def draw(self, generator: np.random.Generator) -> dict[str, float]:
         """Draw parameter values."""
@@ -174,7 +174,7 @@ class Setting:
         problem = self.problem(self.study(values, self.images(values)))
         evaluation = Evaluation(problem, RobustLoss.named("l2", 1.0), problem.start())
         certainty = assess(
-            evaluation.compress(), problem.study.variables, self.residual_count, *evaluation.covered_residuals()
+            evaluation.compress(), problem.study.parameters, self.residual_count, *evaluation.covered_residuals()
         )
         # The image is its own reference: all noise is what `assess` assumes. Those of thicknesses are relative already.
         return {

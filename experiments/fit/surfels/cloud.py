@@ -9,7 +9,8 @@ import warpfrag as wf
 from warpfrag.colors import linear_to_srgb
 from warpfrag.files.meshes import load_mesh
 from warpfrag.scene.camera import Camera
-from warpfrag.scene.scene import Scene, SceneObject
+from warpfrag.scene.scene import Scene
+from warpfrag.scene.surface import SceneObject
 from warpfrag.shapes.mesh import Mesh, lambert, smooth_normals
 from warpfrag.shapes.surfels import PointSet
 

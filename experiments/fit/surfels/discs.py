@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from warpfrag.scene.scene import SceneObject
+from warpfrag.scene.surface import SceneObject
 from warpfrag.shapes.surfels import PointSet, spacing, surfels
 
 # Rim of discs that fall off [spacings], and corners of all: those of the library's surfels.

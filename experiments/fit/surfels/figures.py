@@ -9,10 +9,10 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from tied import Tied
-from warpfrag.resolve.arguments import Merge
 
 from warpfrag.colors import linear_to_srgb
 from warpfrag.fit.losses import psnr
+from warpfrag.scene.names import Merge
 
 STYLE = {
     "font.size": 9,

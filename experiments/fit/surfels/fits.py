@@ -5,11 +5,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from discs import Discs
-from warpfrag.resolve.arguments import Merge
 
 import warpfrag as wf
 from warpfrag.fit import FitParameter, FitResult, Study, View
 from warpfrag.fit.losses import psnr
+from warpfrag.scene.names import Merge
 from warpfrag.scene.scene import Scene
 
 OPAQUE, FALLOFF = "opaque", "falloff"
@@ -63,7 +63,7 @@ class Setting:
 
     def views(self, held_out: bool) -> list[View]:
         """Return the views that are held out, or the others."""
-        return [view for view in self.study.all_views if view.held_out == held_out]
+        return [view for view in self.study.prepared.views if view.held_out == held_out]
 
     def scene(self, discs: str, thickness: float, merge: Merge = "smooth") -> Scene:
         """Return the scene of the discs, their thickness in multiples of P(z)."""
@@ -77,7 +77,7 @@ class Setting:
         """Draw the discs in the colours of the mesh."""
         merge: Merge = "smooth" if thickness else "none"
         scene = self.scene(discs, thickness, merge)
-        images = {view.name: np.asarray(wf.render(scene, view.camera)) for view in self.study.all_views}
+        images = {view.name: np.asarray(wf.render(scene, view.camera)) for view in self.study.prepared.views}
         return Row(discs, (), merge, thickness, images)
 
     def study_of(self, discs: str, fitted: Sequence[str], thickness: float, merge: Merge = "smooth") -> Study:

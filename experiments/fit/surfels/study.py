@@ -18,13 +18,13 @@ from cloud import load_bunny, render_mesh, sample_points, write_points  # noqa: 
 from discs import Discs  # noqa: E402
 from fits import FALLOFF, OPAQUE, PAPER, RADIUS, Row, Setting, images_of, mean_psnr, reference_of  # noqa: E402
 from tied import Tied, fit_tied  # noqa: E402
-from warpfrag.resolve.arguments import Merge  # noqa: E402
 
 import warpfrag as wf  # noqa: E402
 from warpfrag.capture.coverage import Coverage  # noqa: E402
 from warpfrag.files.images import write_image  # noqa: E402
 from warpfrag.fit import Progress, Reference, load_study  # noqa: E402
 from warpfrag.fit.losses import psnr  # noqa: E402
+from warpfrag.scene.names import Merge  # noqa: E402
 from warpfrag.shapes.mesh import Mesh  # noqa: E402
 from warpfrag.studies.summary import Figure, Summary, Table  # noqa: E402
 
@@ -73,10 +73,10 @@ def prepare(mesh: Mesh, size: int | None, steps: int | None, count: int) -> Sett
     """Return the study of study.toml with renders of the mesh as references, and the discs of the points."""
     study = load_study(HERE / "study.toml")
     views = []
-    for view in study.all_views:
+    for view in study.prepared.views:
         camera = view.camera if size is None else view.camera.resized((size, size))
         views.append(replace(view, camera=camera, reference=Reference(render_mesh(mesh, camera))))
-    study = replace(study, views=views, reference=None, steps=steps or study.steps)
+    study = replace(study, views=views, reference=None, steps=steps or study.prepared.steps)
     points = sample_points(mesh, count)
     tried = [Setting(study, Discs(points), Discs(points, rim)) for rim in RIMS]
     return max(tried, key=lambda each: mean_psnr(each.draw(OPAQUE, 0.0).images, each.views(held_out=False)))
@@ -86,7 +86,7 @@ def write_inputs(setting: Setting) -> None:
     """Write what study.toml reads: the points, and the references."""
     write_points(HERE / "points.ply", setting.discs.points)
     (HERE / "views").mkdir(exist_ok=True)
-    for view in setting.study.all_views:
+    for view in setting.study.prepared.views:
         write_image(HERE / "views" / f"{view.name}.png", reference_of(view))
 
 
@@ -106,7 +106,7 @@ class Tuned:
 def tune(setting: Setting) -> dict[tuple[float, int], Tuned]:
     """Fit colours and opacities without the judges, at every learning rate, and judge along the way."""
     views = [replace(view, held_out=view.name in JUDGES) for view in setting.views(held_out=False)]
-    most = max((steps for steps in STEPS if steps <= 4 * int(setting.study.steps or 0)), default=STEPS[0])
+    most = max((steps for steps in STEPS if steps <= 4 * int(setting.study.prepared.steps or 0)), default=STEPS[0])
     found = {}
     for rate in RATES:
         study = replace(setting.study, views=views, learning_rate=rate, steps=most + 1, patience=most + 1)
@@ -229,7 +229,7 @@ def summarise(setting: Setting, rows: dict[str, Row], tied: Tied, tuned: dict[tu
     tuning = (
         f"By learning rate and steps: mean PSNR of {' and '.join(JUDGES)} [dB], left out of these fits, at 10 P(z) / "
         "with the thickness fitted (the thickness found [spacings]). The other fits take "
-        f"{setting.study.learning_rate:g} and {setting.study.steps} steps."
+        f"{setting.study.learning_rate:g} and {setting.study.prepared.steps} steps."
     )
     return Summary(
         name="surfels",

@@ -11,6 +11,7 @@ from discs import Discs
 
 from warpfrag.fit import Study
 from warpfrag.fit.problem import Problem
+from warpfrag.scene.parameters import THICKNESS
 
 # Of the radii [spacings].
 SMALLEST, LARGEST = 0.2, 4.0
@@ -44,13 +45,13 @@ def fit_tied(study: Study, discs: Discs, radius: float) -> Tied:
     import torch
 
     problem = Problem(study)
-    thickness = next(variable for variable in study.variables if variable.key == "thickness")
+    thickness = next(variable for variable in study.prepared.parameters if variable.kind is THICKNESS)
     count, size = len(discs.points.points), len(discs.radii)
     radii = torch.as_tensor(discs.radii)
     color = torch.as_tensor(discs.points.color).clone().requires_grad_()
     opacity = torch.ones(count, dtype=torch.float64, requires_grad=True)
     spread = torch.full((count,), float(np.log(radius)), dtype=torch.float64, requires_grad=True)
-    thick = torch.tensor(float(thickness.inward(thickness.start)), dtype=torch.float64, requires_grad=True)
+    thick = torch.tensor(float(thickness.to_coordinate(thickness.start)), dtype=torch.float64, requires_grad=True)
 
     def values() -> dict[str, torch.Tensor]:
         falloff = torch.exp(-0.5 * (radii / spread.exp()[:, None]) ** 2)
@@ -60,7 +61,7 @@ def fit_tied(study: Study, discs: Discs, radius: float) -> Tied:
             "points.thickness": thick.exp(),
         }
 
-    steps, batch, rate = int(study.steps or 0), int(study.batch or len(problem.views)), study.learning_rate
+    steps, batch, rate = study.prepared.steps, int(study.batch or len(problem.views)), study.learning_rate
     groups = [{"params": [color, opacity, spread]}, {"params": [thick], "lr": thickness.learning_rate or rate}]
     optimizer = torch.optim.Adam(groups, lr=rate)
     generator = np.random.default_rng(study.seed)

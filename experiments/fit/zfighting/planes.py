@@ -13,7 +13,8 @@ import warpfrag as wf
 from warpfrag.capture.surfaces import to_camera_space
 from warpfrag.scene.assemble import assemble
 from warpfrag.scene.camera import Camera
-from warpfrag.scene.scene import Scene, SceneObject
+from warpfrag.scene.scene import Scene
+from warpfrag.scene.surface import SceneObject
 from warpfrag.shapes import primitives
 
 BUFFERS = ("eye", "fixed", "float", "rasteriser")

@@ -77,14 +77,15 @@ class ExactOptions:
 @kernels
 def exact_fwd(number: Any, mix: int, beta_per: int, sink: Sink) -> Any:
     """Return the kernel that resolves pixels into a sink, all slabs at once."""
-    slab, sweep_type, seen_type, put, finish = Slab[number], Sweep[number], Seen[number], sink.put, sink.finish
+    slab, sweep_type, seen_type, out_type = Slab[number], Sweep[number], Seen[number], sink.arrays[number]
+    put, finish = sink.put, sink.finish
 
     def kernel(
         span: Span,
         lists: FragmentLists[number],
         scratch: IntervalScratch[number],
         invalid: wp.array2d(dtype=int),
-        out: sink.arrays[number],
+        out: out_type,
     ):
         """Resolve pixels.
 
@@ -279,13 +280,13 @@ def take_back(
 @kernels
 def exact_bwd(number: Any, mix: int, beta_per: int) -> Any:
     """Return the kernel of the way back from layers."""
-    sweep_type = Sweep[number]
+    sweep_type, out_type = Sweep[number], LAYERS.arrays[number]
 
     def kernel(
         span: Span,
         lists: FragmentLists[number],
         scratch: IntervalScratch[number],
-        grad_out: LAYERS.arrays[number],
+        grad_out: out_type,
         grads: FragmentGradients[number],
     ):
         """Take the gradient back through pixels.
