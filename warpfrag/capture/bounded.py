@@ -148,7 +148,7 @@ def _backward(
         return
     fragment_size = fragment_bytes(inputs.points.dtype, gradient=True)
     allowed = max(BAND_BYTES, int(row_counts.max()) * fragment_size)
-    for begin, end in split_rows(row_counts, 0.0, fragment_size, allowed):
+    for begin, end in split_rows(row_counts, row_counts * fragment_size, allowed):
         pixels = slice(begin * options.width, end * options.width)
         band = replace(options, first_row=options.first_row + begin, row_count=end - begin)
         own = {name: None if grad is None else grad[pixels] for name, grad in vars(grads).items()}

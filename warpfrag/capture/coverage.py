@@ -203,7 +203,7 @@ def find_coverage(
 ) -> Coverage:
     """Find out which of the surfaces the pixels of a window see; arguments are those of `Coverage.of`."""
     triangles = surfaces.triangles(window)
-    budget = Budget.of(CaptureSizes.of(triangles), memory_limit, surfaces)
+    budget = Budget.of(CaptureSizes.of(triangles, surfaces), memory_limit, surfaces)
     return store_coverage(scene, camera, surfaces, triangles, count_fragments(triangles), budget, sort=sort)
 
 
@@ -233,7 +233,12 @@ def store_coverage(
     Raises:
         MemoryError: there would be more fragments than the budget allows.
     """
-    room = Room(counts.shape[0], triangles.points.dtype, triangles.device, budget.reserve, sort, counts)
+    pixel_count = counts.shape[0]
+
+    def reserve(storage_bytes: int, what: str, fragment_count: int) -> None:
+        budget.check(fragment_count, pixel_count, what, storage_bytes)
+
+    room = Room(pixel_count, triangles.points.dtype, triangles.device, reserve, sort, counts)
     lists = fill(storage, triangles, room)
     sort_lists(lists)
     found = (triangles.corners, lists.items, lists.offsets, triangles.points)
