@@ -136,10 +136,11 @@ def parse_thickness(option: str, text: str) -> dict[str, Any]:
 def with_values(scene: "Scene", values: Mapping[str, Any]) -> "Scene":
     """Return a scene with parameters built in; poses last, as a turn is about the middle of what is there."""
     from warpfrag.scene.pose import POSE_KEYS, posed
+    from warpfrag.scene.scene import PARAMETER_KEYS
 
     objects = []
     for item in scene.objects:
-        own = {key: values[name] for key in _OBJECT_KEYS if (name := f"{item.name}.{key}") in values}
+        own = {key: values[name] for key in PARAMETER_KEYS if (name := f"{item.name}.{key}") in values}
         if "thickness" in values:
             own.setdefault("thickness", values["thickness"])
         # A value of its own may come with its unit.
@@ -150,9 +151,6 @@ def with_values(scene: "Scene", values: Mapping[str, Any]) -> "Scene":
     scene = replace(scene, objects=objects, beta=float(values.get("beta", scene.beta)))
     poses = {name: value for name, value in values.items() if name.rpartition(".")[2] in POSE_KEYS}
     return posed(scene, poses) if poses else scene
-
-
-_OBJECT_KEYS = ("thickness", "color", "opacity", "vertices")
 
 
 def _with_settings(scene: "Scene", settings: Sequence[str]) -> "Scene":
@@ -195,11 +193,13 @@ def _parse_value(name: str, text: str) -> Any:
 
 
 def _numbers(option: str, text: str, counts: Sequence[int], expected: str) -> list[float]:
+    from warpfrag.files.table import LARGEST
+
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:
         numbers = []
-    if len(numbers) not in counts:
+    if len(numbers) not in counts or any(abs(number) > LARGEST for number in numbers):
         raise UsageError(f"{option}: got {_shown(text)}, expected {expected}")
     return numbers
 
