@@ -20,7 +20,7 @@ def ramp(tmp_path):
     pixels = np.zeros((4, 4, 3), "u1")
     pixels[..., 0] = np.arange(4) * 60 + 40
     Image.fromarray(pixels).save(tmp_path / "ramp.png")
-    Image.fromarray(pixels).save(tmp_path / "my ramp.png")
+    Image.fromarray(pixels).save(tmp_path / "my own.png")
     return tmp_path
 
 
@@ -44,9 +44,9 @@ def reds(mesh):
     ("options", "expected"),
     [
         ("ramp.png", [40, 100, 160, 220]),
-        ("my ramp.png", [40, 100, 160, 220]),
+        ("my own.png", [40, 100, 160, 220]),
         ("-o 0.5 0 0 -s 1 1 1 -clamp off ramp.png", [160, 220, 40, 100]),
-        ("-o 0.5 my ramp.png", [160, 220, 40, 100]),
+        ("-o 0.5 my own.png", [160, 220, 40, 100]),
         ("-clamp on -o 0.5 ramp.png", [160, 220, 220, 220]),
         ("-s -1 1 1 -blendu on -texres 512 ramp.png", [220, 160, 100, 40]),
     ],
@@ -138,3 +138,17 @@ def test_lines_comments_and_continuations(tmp_path):
     text = "  v 0 0 0 # first\nv\t1 0 0\nv 0 1 \\\n0\nf 1 2 \\\n 3 # face\nl 1 2\n"
     with pytest.warns(UserWarning, match="lines are not drawn$"):
         assert load_mesh(write(tmp_path, text)).faces.tolist() == [[0, 1, 2]]
+
+
+def test_coordinates_that_are_not_there(tmp_path):
+    """Faces that name coordinates or normals beyond the file's are drawn without; positions have to be there."""
+    with pytest.warns(UserWarning, match="some faces name coordinates that are not there, drawn without"):
+        assert len(load_mesh(write(tmp_path, SQUARE + "f 1/7 2/8 3/9\n")).faces) == 1
+    with pytest.raises(ValueError, match="a face names vertex 7, there are 4"):
+        load_mesh(write(tmp_path, SQUARE + "f 1 2 7\n"))
+
+
+def test_materials_that_are_invisible_are_named(tmp_path):
+    """`Tr 1` is fully transparent, whatever the program that wrote it meant."""
+    with pytest.warns(UserWarning, match='a material of "Tr 1.0" is invisible'):
+        assert load_mesh(write(tmp_path, SQUARE + "usemtl a\nf 1 2 3\n", "newmtl a\nTr 1.0\n")).opacity == 0.0

@@ -286,3 +286,9 @@ def test_groups_are_objects_of_their_own(tmp_path):
     write(tmp_path, "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\ng left\nf 1 2 3\ng right\nf 3 2 1\n", "tri.obj")
     items = objects(tmp_path, '[[object]]\nmesh = "tri.obj"\nsplit = "groups"\nthickness = 0.5\n')
     assert [(item.name, item.thickness) for item in items] == [("tri", 0.5), ("left", 0.5), ("right", 0.5)]
+
+
+def test_objects_that_nobody_has_named_are_numbered(tmp_path):
+    """Two spheres without names are told apart; a name that is given twice is refused."""
+    items = objects(tmp_path, '[[object]]\nprimitive = "sphere"\n' * 2 + '[[object]]\nprimitive = "cube"\n')
+    assert [item.name for item in items] == ["sphere", "sphere 2", "cube"]

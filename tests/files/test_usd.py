@@ -181,3 +181,10 @@ def test_the_process_that_reads_has_limits(tmp_path, monkeypatch, script, words)
     monkeypatch.setattr(usd, "MOST_BYTES", 2**30)
     with pytest.raises(ValueError, match=rf"got a USD file that cannot be read: .*a.usda \({words}\)"):
         load_mesh(stage(tmp_path, ""))
+
+
+def test_references_that_lead_nowhere_are_named(tmp_path):
+    """A missing reference leaves the rest of the stage, with one warning."""
+    text = f'def "gone" (references = @no.usda@)\n{{\n}}\ndef Mesh "m" {{\n{TRIANGLE}}}\n'
+    with pytest.warns(UserWarning, match=r"a.usda: cannot find .*no.usda$"):
+        assert len(load_mesh(stage(tmp_path, text)).faces) == 1

@@ -80,7 +80,8 @@ def test_parameters_round_trip():
     parameters = scene.parameters()
     keys = ("thickness", "color", "opacity", "vertices", "translation", "rotation")
     names = {f"{name}.{key}" for name in ("tri", "square") for key in keys}
-    assert set(parameters) == {"beta", "camera.translation", "camera.rotation", *names}
+    cameras = {f"camera.{key}" for key in ("translation", "rotation", "fov", "principal")}
+    assert set(parameters) == {"beta", *cameras, *names}
     assert parameters["tri.opacity"] == 0.5
     same = assemble(scene, parameters)
     for name in ("vertices", "rgba", "thickness"):

@@ -16,6 +16,7 @@ A `color` replaces the file's colours and the colours of its images; an `opacity
 cuts out (alpha 0) stays cut out.
 """
 
+from collections.abc import Container
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -84,6 +85,9 @@ def read_objects(top: Table) -> list[SceneObject]:
     for index, entry in enumerate(entries):
         for item in _objects(entry, index, reading):
             place = f"{top.file}: object[{index}].name"
+            if "name" not in entry and item.name in owner:
+                # Nobody has named it: it takes the next number.
+                item = replace(item, name=_free_name(item.name, owner))
             if item.name == CAMERA:
                 raise SceneError(f'{place}: got "camera", expected another: the camera has it')
             if item.name in owner:
@@ -143,12 +147,17 @@ def _names_of_parts(parts: list[Mesh], stem: str) -> list[str]:
     names: list[str] = []
     for part in parts:
         plain = " ".join(part.name.split()) or stem
-        name, number = plain, 1
-        while name in names or name == CAMERA:
-            number += 1
-            name = f"{plain} {number}"
-        names.append(name)
+        names.append(_free_name(plain, [*names, CAMERA]))
     return names
+
+
+def _free_name(name: str, taken: Container[str]) -> str:
+    """Return a name, with the least number that makes it one of its own."""
+    free, number = name, 1
+    while free in taken:
+        number += 1
+        free = f"{name} {number}"
+    return free
 
 
 def _scene_object(table: Table, name: str, mesh: Mesh, reading: _Reading, thickness_value: Any) -> SceneObject:

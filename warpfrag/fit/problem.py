@@ -80,6 +80,10 @@ class ViewProblem:
             fragments = fragments.torch(beta.device)
         return self.over_background(self.composite(fragments, beta))
 
+    def sees_something(self, image: np.ndarray) -> bool:
+        """Tell whether any object is in an image of this view."""
+        return bool((image != np.asarray(self.scene.background, image.dtype)).any()) or bool(self.coverage.count)
+
     def composite(self, fragments: Fragments, beta: Any) -> Any:
         """Composite fragments as the scene says, without its background."""
         scene = self.scene

@@ -27,6 +27,7 @@ from warpfrag.fit.second_look import JUMPS, falling_steps, unseen_changes
 from warpfrag.fit.session import CHECKPOINT, FitError, Progress, Session, fingerprint
 from warpfrag.fit.study import PreparedStudy, Study
 from warpfrag.fit.study_file import load_study
+from warpfrag.scene.visibility import why_empty
 
 METHODS: dict[str, Any] = {"least_squares": LeastSquares, "adam": Adam, "lbfgs": LBFGS}
 
@@ -107,6 +108,11 @@ def _run(study: Study, resume: bool, output: Path | None, report: Callable[[Prog
         runs = [method.run(start) for start in _starts(problem, notes)]
         session.save()
     best = min(runs, key=lambda run: run.loss)
+    notes += [
+        f"{view.view.name}: {why_empty(view.scene)}"
+        for view, image in zip([*problem.views, *problem.held_out], before, strict=True)
+        if not view.sees_something(image)
+    ]
     falling = falling_steps(problem, method, best.coordinates, best.loss) if best.converged else []
     if falling:
         reason = f"{best.reason}; yet a step of a thousandth of its range lowers the loss in {', '.join(falling)}"

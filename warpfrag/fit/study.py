@@ -186,8 +186,8 @@ class PreparedStudy:
 
     @property
     def is_global(self) -> bool:
-        """Whether every parameter is few values, for a whole object, scene or view."""
-        return all(each.is_global for each in self.parameters)
+        """Whether every parameter is few values with columns in the Jacobian."""
+        return all(each.is_global and each.kind.in_jacobian for each in self.parameters)
 
     @property
     def true(self) -> dict[str, np.ndarray] | None:
@@ -267,12 +267,12 @@ def _check_held_out(views: Sequence[View], parameters: Sequence[FittedParameter]
 def _chosen_method(study: Study, parameters: Sequence[FittedParameter], image_loss: ImageLoss) -> Method:
     """Return the method of a study, its own or the default, once it is known to go with all else."""
     robust = image_loss.robust is not None
-    other = next((each.name for each in parameters if not each.is_global), None)
+    other = next((each.name for each in parameters if not (each.is_global and each.kind.in_jacobian)), None)
     method = study.method
     if method is None:
         method = "least_squares" if other is None and robust and study.batch is None else "adam"
     if method == "least_squares" and other is not None:
-        expected = '"adam" or "lbfgs" (least squares fits few values per object)'
+        expected = '"adam" or "lbfgs" (least squares fits few values per object, and no lens)'
         raise StudyError(f'method: got "least_squares" for {other}, expected {expected}')
     if method == "least_squares" and not robust:
         raise StudyError(f'loss: got {shorten(study.loss)} with "least_squares", expected "l2", "l1" or "huber"')

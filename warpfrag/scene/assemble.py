@@ -18,6 +18,7 @@ import numpy as np
 from warpfrag.arrays.kinds import NUMPY, Kind, dtype_name, kind_of
 from warpfrag.errors import check_choice, shorten
 from warpfrag.scene.camera import Camera
+from warpfrag.scene.lens import Lens, through_lens
 from warpfrag.scene.light import transformed_normals, turned_normals
 from warpfrag.scene.names import CAMERA, POSE_KEYS
 from warpfrag.scene.parameters import (
@@ -58,6 +59,8 @@ class Geometry:
         thickness_maps: z-thickness per pixel (H, W), by object index, for the objects that have a map.
         thickness_in_p: whether the thickness of each object is in multiples of P(z), (objects,) bool NumPy.
         precision: of the image, and of `rgba`, `thickness` and the maps.
+        camera: the camera, with the lens that parameters give it.
+        lens: how points in camera space move with that; None without gradients.
         camera_pose: how the camera is moved: translation [scene units] and rotation vector [degrees] in its own axes,
             (3,) float64 each; None where it stays.
     """
@@ -73,6 +76,8 @@ class Geometry:
     textures: list[np.ndarray]
     thickness_maps: dict[int, Any]
     thickness_in_p: np.ndarray
+    camera: Camera
+    lens: Lens | None = None
     precision: Precision = "float32"
     camera_pose: tuple[Any, Any] | None = None
 
@@ -169,6 +174,7 @@ def assemble(
     known = scene.described()
     scene, overrides = _checked(scene, parameters or {}, known)
     frame = Frame.of(overrides, known)
+    camera, lens = through_lens(camera, overrides, known, bounds, frame.double)
     if COMMON_THICKNESS.key in overrides:
         # One array for all: a map is then there once.
         common = known[COMMON_THICKNESS.key].bounded(frame.array(overrides[COMMON_THICKNESS.key]), bounds)
@@ -221,6 +227,8 @@ def assemble(
         textures=textures,
         thickness_maps=thickness_maps,
         thickness_in_p=np.array([item.thickness_unit == "P" for item in scene.objects], dtype=bool),
+        camera=camera,
+        lens=lens,
         precision=frame.precision,
         camera_pose=camera_pose,
     )

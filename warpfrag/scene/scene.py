@@ -71,7 +71,7 @@ class Scene:
 
     def described(self) -> dict[str, Parameter]:
         """Return what is known of each parameter that `parameters=` takes, by name."""
-        return describe(self.objects)
+        return describe(self.objects, self.camera)
 
     def parameters(self) -> dict[str, float | np.ndarray]:
         """Return what can be overridden, fitted or differentiated, by name.
@@ -191,7 +191,7 @@ class Scene:
         if kind.field is None:
             return np.zeros(kind.value_shape, dtype=np.float32)
         owners: dict[str, Any] = {"": self, CAMERA: self.camera, **{item.name: item for item in self.objects}}
-        value = getattr(owners[parameter.owner], kind.field)
+        value = getattr(owners[parameter.owner], kind.shown or kind.field)
         if np.ndim(value) == 0:
             return float(value)
         return np.array(value, dtype=np.float64 if getattr(value, "dtype", None) == np.float64 else np.float32)

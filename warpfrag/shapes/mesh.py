@@ -39,11 +39,6 @@ class Mesh:
     name: str = ""
 
 
-def named(mesh: Mesh, name: str) -> Mesh:
-    """Return a mesh under a name."""
-    return replace(mesh, name=name)
-
-
 def placed(mesh: Mesh, matrix: np.ndarray) -> Mesh:
     """Move a mesh by a matrix (4, 4); its outside stays outside, also where the matrix mirrors it."""
     matrix = np.asarray(matrix, dtype=np.float64)
