@@ -1,20 +1,26 @@
 """From a scene to its image: options, background, gradients, and bands of rows under a memory limit."""
 
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+import warp as wp
 from capture_scenes import orthographic, perspective, quad, scene, soup, surface
 
-from warpfrag import render as render_module
 from warpfrag.capture import memory
-from warpfrag.capture.coverage import capture
+from warpfrag.capture.coverage import Coverage, capture
+from warpfrag.capture.memory import Budget, CaptureSizes
+from warpfrag.capture.surfaces import surfaces_of
 from warpfrag.composite import composite
 from warpfrag.files.scene_file import load_scene
-from warpfrag.render import render
+from warpfrag.raster.ray import Window
+from warpfrag.render import Renderer, render
 from warpfrag.scene.depth_resolution import z_resolution
 from warpfrag.shapes.primitives import sphere
+from warpfrag.storage.kbuffer import kbuffer
+from warpfrag.storage.method import count_fragments
 
 SCENES = Path(__file__).parents[1] / "scenes"
 
@@ -93,10 +99,11 @@ def test_image_is_differentiable_in_all_scene_parameters():
 
 def limits(setting, parameters=None) -> list[float]:
     """Return memory limits under which an image falls into a few bands."""
-    fragments = capture(setting, parameters=parameters)
-    size = 2 if fragments.kind == "torch" else 1
-    fixed = memory.STRIP_BYTES * 70 + 5000 if size == 2 else 60 * 28
-    return [fixed + fragments.count * 36 * size / part for part in (1.5, 3, 6)]
+    surfaces = surfaces_of(setting, setting.camera, parameters)
+    triangles = surfaces.triangles(Window.of(setting.camera))
+    budget = Budget.of(CaptureSizes.of(triangles, surfaces), None, surfaces, image=True)
+    counts = count_fragments(triangles).numpy()
+    return [budget.fixed + float(budget.needed(counts.sum(), len(counts))) / part for part in (1.5, 3, 6)]
 
 
 def test_bands_have_the_same_pixels(monkeypatch):
@@ -111,7 +118,7 @@ def test_bands_have_the_same_pixels(monkeypatch):
         bands.append(memory.split_rows(*arguments))
         return bands[-1]
 
-    monkeypatch.setattr(render_module, "split_rows", split_rows)
+    monkeypatch.setattr(sys.modules[render.__module__], "split_rows", split_rows)
     whole = render(setting, beta=beta)
     assert not bands
     for limit in limits(setting):
@@ -132,57 +139,13 @@ def test_bands_have_the_same_gradients():
         return image, torch.autograd.grad(image.square().sum(), list(values.values()))
 
     image, grads = run(None)
-    limit = limits(setting, {"beta": torch.tensor(0.4)})[2]
+    opacity = torch.tensor(setting.parameters()["soup.opacity"], requires_grad=True)
+    limit = limits(setting, {"soup.opacity": opacity})[2]
     banded, banded_grads = run(limit)
     assert torch.equal(image, banded)
     for one, other in zip(grads, banded_grads, strict=True):
         # Single precision sums over some thousand fragments.
         torch.testing.assert_close(other, one, rtol=1e-3, atol=1e-3 * float(one.abs().max()))
-
-
-def test_split_rows_takes_as_few_bands_as_fit():
-    """Rows are packed from the top; a row that does not fit is an error with both numbers."""
-    counts = np.array([1, 1, 2, 0, 3, 1])
-    assert memory.split_rows(counts, 0.0, 10, 40.0) == [(0, 4), (4, 6)]
-    assert memory.split_rows(counts, 0.0, 10, 80.0) == [(0, 6)]
-    assert memory.split_rows(counts, 0.0, 10, 30.0) == [(0, 2), (2, 4), (4, 5), (5, 6)]
-    with pytest.raises(MemoryError, match=r"row 4 with its 3 fragments would take 30 B, expected at most 29 B"):
-        memory.split_rows(counts, 0.0, 10, 29.0)
-
-
-def test_memory_is_refused_with_both_numbers():
-    """A capture, a row, or the triangles alone beyond the limit are refused before anything is stored."""
-    setting = scene(perspective((64, 64)), quad(2.0), quad(3.0, name="other"))
-    with pytest.raises(MemoryError, match=r"8192 fragments would take 288\.\d KiB, expected at most 97\.66 KiB"):
-        capture(setting, memory_limit=100_000)
-    assert capture(setting, memory_limit=300_000).count == 8192
-    with pytest.raises(MemoryError, match=r"row 0 with its 128 fragments would take 4\.5 KiB, expected at most 3"):
-        render(setting, memory_limit=4_000)
-    with pytest.raises(MemoryError, match=r"4 triangles would take 176 B, expected at most 50 B"):
-        render(setting, memory_limit=50)
-
-
-def test_gradients_are_counted_in_the_prediction():
-    """With gradients a fragment takes more memory."""
-    setting = scene(perspective((64, 64)), quad(2.0), quad(3.0, name="other"))
-    values = {"quad.opacity": torch.tensor(0.5, requires_grad=True)}
-    with pytest.raises(MemoryError, match=r"8192 fragments would take 48\d"):
-        capture(setting, parameters=values, memory_limit=300_000)
-    assert capture(setting, parameters=values, memory_limit=600_000).count == 8192
-
-
-def test_default_limit_is_half_of_the_free_memory(monkeypatch):
-    """Without a limit, half of what the system says is free; all where it says nothing."""
-    import warp as wp
-
-    cpu = wp.get_device("cpu")
-    assert memory.free_memory(cpu) > 2**20
-    monkeypatch.setattr(memory, "free_memory", lambda device: 1000)
-    assert memory.allowed_memory(None, cpu) == 500
-    with pytest.raises(MemoryError, match="expected at most 500 B"):
-        capture(scene(perspective((64, 64)), quad(2.0)))
-    monkeypatch.setattr(memory, "free_memory", lambda device: None)
-    assert memory.allowed_memory(None, cpu) == float("inf")
 
 
 @pytest.mark.parametrize("objects", [[], [quad(-2.0)]], ids=["none", "behind"])
@@ -220,7 +183,7 @@ def test_arguments_are_checked():
     setting = crowd()
     with pytest.raises(TypeError, match="scene: got dict"):
         render({})
-    with pytest.raises(ValueError, match="merge: got 'simple'"):
+    with pytest.raises(ValueError, match='merge: got "simple"'):
         render(setting, merge="simple")
     with pytest.raises(ValueError, match="max_layers: got 0"):
         render(setting, max_layers=0)
@@ -256,3 +219,76 @@ def test_coplanar_cubes_show_speckle_only_without_merging():
     assert sign_changes("none") > 100
     # What is left are a few pixels on edges of the cubes' far sides.
     assert sign_changes("smooth") < 0.05 * sign_changes("none")
+
+
+LOOKS = ({"soup.opacity": 0.3}, {"more.color": [0.1, 0.9, 0.2]}, {"thickness": 0.2}, {"beta": 0.8}, {})
+
+
+@pytest.mark.parametrize("resolve", ["sorted", "kbuffer"])
+def test_renderer_sees_once_while_nothing_moves(resolve, monkeypatch):
+    """Looks and beta leave what each pixel sees as it is; its images are those of new renderers, to the bit."""
+    setting = crowd(merge="order_independent", layers=3)
+    renderer = Renderer(setting, resolve=resolve)
+    module, searches = sys.modules[Renderer.__module__], []
+    monkeypatch.setattr(module, "count_fragments", lambda t: searches.append(t) or count_fragments(t))
+    images = [renderer.image(look) for look in LOOKS]
+    assert len(searches) == 1
+    for look, image in zip(LOOKS, images, strict=True):
+        np.testing.assert_array_equal(image, Renderer(setting, resolve=resolve).image(look))
+    moved = {"soup.translation": [0.1, 0.0, 0.0]}
+    np.testing.assert_array_equal(renderer.image(moved), Renderer(setting, resolve=resolve).image(moved))
+    renderer.image({**moved, "soup.opacity": 0.1})
+    assert len(searches) == 1 + len(LOOKS) + 2
+    assert (images[-1] != renderer.image(moved)).any()
+
+
+def test_renderer_makes_the_images_of_render_and_kbuffer():
+    """Sorted it is `render`; as a k-buffer the composite of `kbuffer`; with the scene's background or without."""
+    setting = crowd(background=(0.1, 0.2, 0.3, 0.5), merge="none")
+    np.testing.assert_array_equal(Renderer(setting).image({"beta": 0.7}), render(setting, beta=0.7))
+    image = Renderer(setting, resolve="kbuffer", max_layers=2, background=False).image()
+    np.testing.assert_array_equal(image, composite(kbuffer(capture(setting, sort=False), 2, merge="none")))
+    renderer = Renderer(setting, resolve="kbuffer")
+    assert isinstance(renderer.coverage, Coverage)
+    found, expected = renderer.fragments({"soup.opacity": 0.2}), capture(setting, parameters={"soup.opacity": 0.2})
+    assert found.count == renderer.coverage.count == expected.count
+    np.testing.assert_array_equal(found.object_id, capture(setting, sort=False).object_id)
+
+
+@pytest.mark.parametrize("resolve", ["sorted", "kbuffer"])
+def test_gradients_of_a_renderer_that_has_seen_already(resolve):
+    """They are those of a new one, to the bit, in looks and in what moves."""
+    setting = crowd(merge="order_independent", layers=3)
+    names = ["soup.vertices", "more.color", "soup.opacity", "camera.rotation"]
+
+    def gradients(renderer):
+        own = setting.parameters()
+        values = {name: torch.tensor(np.asarray(own[name]), dtype=torch.float32, requires_grad=True) for name in names}
+        return torch.autograd.grad(renderer.image(values).square().sum(), list(values.values()))
+
+    renderer = Renderer(setting, resolve=resolve)
+    renderer.image()
+    for one, other in zip(gradients(renderer), gradients(Renderer(setting, resolve=resolve)), strict=True):
+        assert one.any()
+        assert torch.equal(one, other)
+
+
+def test_renderer_without_room_for_a_kbuffers_fragments():
+    """Fragments that do not fit go straight into the slots: the same image, and nothing is kept."""
+    setting = crowd((20, 18), merge="none", layers=1)
+    setting.objects.extend(quad(2.0 + 0.1 * i, name=f"quad{i}", opacity=0.1) for i in range(80))
+    free = Renderer(setting, resolve="kbuffer")
+    tight = Renderer(setting, resolve="kbuffer", memory_limit=0.7e6)
+    np.testing.assert_array_equal(tight.image(), free.image())
+    with pytest.raises(MemoryError, match=r"\d+ fragments would take .* expected at most 683\.6 KiB"):
+        tight.fragments()
+
+
+def test_renderers_arguments_are_checked():
+    """Wrong arguments are named when a renderer is made."""
+    with pytest.raises(ValueError, match='resolve: got "sort", expected "sorted" or "kbuffer"'):
+        Renderer(crowd(), resolve="sort")
+    with pytest.raises(ValueError, match='merge: got "smooth", expected "none" or "order_independent"'):
+        Renderer(crowd(), resolve="kbuffer")
+    with pytest.raises(TypeError, match=r"beta: got a wp\.array"):
+        Renderer(crowd()).image({"beta": wp.zeros(1, device="cpu")})

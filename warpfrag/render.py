@@ -10,18 +10,19 @@ import warp as wp
 from warpfrag.arrays.kinds import dtype_name, kind_of
 from warpfrag.capture.bounded import kbuffer_of_surfaces
 from warpfrag.capture.coverage import Coverage, store_coverage
-from warpfrag.capture.memory import Budget, CaptureSizes, refuse, split_rows
+from warpfrag.capture.memory import Budget, CaptureSizes, split_rows
 from warpfrag.capture.surfaces import CameraSurfaces, SurfaceTables, check_scene, surfaces_of
 from warpfrag.composite import composite
 from warpfrag.errors import check_choice
 from warpfrag.fragments import Fragments
 from warpfrag.raster.ray import Window
-from warpfrag.raster.triangles import RasterTriangles
 from warpfrag.resolve.options import check_options
 from warpfrag.scene.camera import Camera
 from warpfrag.scene.names import Merge, Mix
+from warpfrag.scene.parameters import Bounds, bounded_beta
 from warpfrag.scene.scene import Scene
-from warpfrag.storage.into_slots import check_kbuffer
+from warpfrag.scene.visibility import warn_if_empty
+from warpfrag.storage.into_slots import check_kbuffer, kbuffer_bytes
 from warpfrag.storage.kbuffer import kbuffer
 from warpfrag.storage.method import count_fragments
 
@@ -30,10 +31,10 @@ Resolve = Literal["sorted", "kbuffer"]
 
 @dataclass(frozen=True, eq=False)
 class _Counted:
-    """Triangles that need too much memory to be seen at once, and how many fragments each pixel has of them."""
+    """How many fragments each pixel, (P,), and each row has, of which there is no room for all at once."""
 
-    triangles: RasterTriangles
     counts: wp.array
+    row_counts: np.ndarray
 
 
 class Renderer:
@@ -53,6 +54,7 @@ class Renderer:
         merge: see `resolve` or `kbuffer`; default the scene's.
         mix: see `resolve`; default the scene's. A k-buffer has none.
         background: whether to composite over the scene's background.
+        bounds: see `render`.
         memory_limit: see `render`.
 
     Raises:
@@ -76,13 +78,14 @@ class Renderer:
         merge: Merge | None = None,
         mix: Mix | None = None,
         background: bool = True,
+        bounds: Bounds = "clamp",
         memory_limit: float | None = None,
     ):
         self.camera = check_scene(scene, camera)
         self.scene, self.resolve, self.beta = scene, resolve, beta
         self.max_layers = scene.layers if max_layers is None else max_layers
         self.merge, self.mix = merge or scene.merge, mix or scene.mix
-        self.background, self.memory_limit = background, memory_limit
+        self.background, self.bounds, self.memory_limit = background, bounds, memory_limit
         check_choice("resolve", resolve, get_args(Resolve))
         if resolve == "kbuffer":
             check_kbuffer(self.max_layers, self.merge, "mix")
@@ -128,20 +131,20 @@ class Renderer:
         if kind is not None and kind.name == "warp":
             raise TypeError("beta: got a wp.array, expected a number, a NumPy array or a torch.Tensor")
         surfaces = self._surfaces(values)
-        beta = _beta_like(values.get("beta", self.scene.beta), surfaces)
+        beta = bounded_beta(_beta_like(values.get("beta", self.scene.beta), surfaces), self.bounds)
         with surfaces.in_order():
             found = self._cover(surfaces)
             if isinstance(found, Coverage):
-                image = self._composite(found.shade_surfaces(surfaces, moved=False), beta)
-            elif self.resolve == "kbuffer":
-                options = {"slots": self.max_layers, "merge": self.merge, "tail": "mix"}
-                image = composite(kbuffer_of_surfaces(surfaces, Window.of(self.camera), self.memory_limit, **options))
-            else:
-                image = self._image_in_bands(surfaces, found, beta)
-        return over_background(image, self.scene.background) if self.background else image
+                warn_if_empty(found.count, self.scene, self.camera)
+                return self._composite(found, surfaces, beta)
+            if self.resolve == "sorted":
+                return self._image_in_bands(surfaces, found, beta)
+            window, limit = Window.of(surfaces.camera), self.memory_limit
+            layers = kbuffer_of_surfaces(surfaces, window, limit, slots=self.max_layers, merge=self.merge, tail="mix")
+            return self._over_background(composite(layers))
 
     def _surfaces(self, parameters: Mapping[str, Any]) -> CameraSurfaces:
-        surfaces = surfaces_of(self.scene, self.camera, parameters, self._tables)
+        surfaces = surfaces_of(self.scene, self.camera, parameters, self._tables, bounds=self.bounds)
         self._tables = surfaces.tables
         return surfaces
 
@@ -149,45 +152,56 @@ class Renderer:
         found = self._cover(surfaces)
         if isinstance(found, Coverage):
             return found
-        total = int(found.counts.numpy().sum(dtype=np.int64))
-        self._budget(surfaces).reserve(0, f"{total} fragments", total)
+        total = int(found.row_counts.sum())
+        self._budget(surfaces).check(total, self._pixel_count, f"{total} fragments")
         raise AssertionError("what does not fit is refused")
 
     def _cover(self, surfaces: CameraSurfaces) -> Coverage | _Counted:
         """Return what each pixel sees, kept from the last time if that is the same, or why there is no room for it."""
         kept = self._coverage
         if kept is not None and kept.is_of(surfaces):
-            if self._budget(surfaces).allows(kept.count):
+            if self._budget(surfaces).allows(kept.count, self._pixel_count):
                 self._coverage = kept.to(surfaces.device)
                 return self._coverage
             self._coverage = None
-        triangles = surfaces.triangles(Window.of(self.camera))
-        self._sizes = CaptureSizes.of(triangles)
+        triangles = surfaces.triangles(Window.of(surfaces.camera))
+        self._sizes = CaptureSizes.of(triangles, surfaces)
         budget, counts = self._budget(surfaces), count_fragments(triangles)
-        if not budget.allows(int(counts.numpy().sum(dtype=np.int64))):
-            return _Counted(triangles, counts)
+        row_counts = counts.numpy().reshape(self.camera.shape).sum(axis=1, dtype=np.int64)
+        if not budget.allows(int(row_counts.sum()), self._pixel_count):
+            return _Counted(counts, row_counts)
         # The old one goes before the new one comes.
         self._coverage = kept = None
         self._coverage = store_coverage(
-            self.scene, self.camera, surfaces, triangles, counts, budget, sort=self.resolve == "sorted"
+            self.scene, surfaces.camera, surfaces, triangles, counts, budget, sort=self.resolve == "sorted"
         )
         return self._coverage
 
     def _budget(self, surfaces: CameraSurfaces) -> Budget:
         assert self._sizes is not None
-        return Budget.of(self._sizes, self.memory_limit, surfaces)
+        layer = kbuffer_bytes(1, self.max_layers, surfaces.number) if self.resolve == "kbuffer" else 0
+        return Budget.of(self._sizes, self.memory_limit, surfaces, image=True, layer=layer)
 
-    def _composite(self, fragments: Fragments, beta: Any) -> Any:
+    def _composite(self, coverage: Coverage, surfaces: CameraSurfaces, beta: Any) -> Any:
+        """Return the image of what surfaces look like where they are seen."""
+        # Not held by a name: with the image there, the fragments may go.
         if self.resolve == "kbuffer":
-            return composite(kbuffer(fragments, self.max_layers, merge=self.merge))  # type: ignore[arg-type]
-        return composite(fragments, beta, max_layers=self.max_layers, merge=self.merge, mix=self.mix)
+            layers = kbuffer(coverage.shade_surfaces(surfaces, moved=False), self.max_layers, merge=self.merge)  # type: ignore[arg-type]
+            return self._over_background(composite(layers))
+        options = {"max_layers": self.max_layers, "merge": self.merge, "mix": self.mix}
+        return self._over_background(composite(coverage.shade_surfaces(surfaces, moved=False), beta, **options))
+
+    def _over_background(self, image: Any) -> Any:
+        return over_background(image, self.scene.background) if self.background else image
+
+    @property
+    def _pixel_count(self) -> int:
+        return self.camera.shape[0] * self.camera.shape[1]
 
     def _image_in_bands(self, surfaces: CameraSurfaces, found: _Counted, beta: Any) -> Any:
         budget, counts, width = self._budget(surfaces), found.counts, self.camera.width
-        if budget.fixed >= budget.allowed:
-            refuse(budget.fixed, budget.allowed, f"{found.triangles.count} triangles")
-        row_counts = counts.numpy().reshape(-1, width).sum(axis=1, dtype=np.int64)
-        bands = split_rows(row_counts, 0.0, budget.fragment, budget.allowed - budget.fixed)
+        row_bytes = budget.needed(found.row_counts, width)
+        bands = split_rows(found.row_counts, row_bytes, budget.allowed, budget.fixed)
 
         def band_image(begin: int, end: int, *arrays: Any) -> Any:
             """Render rows from points, colours, thickness, maps and beta: arguments, as checkpoints want them."""
@@ -195,11 +209,10 @@ class Renderer:
             part = replace(surfaces, **dict(zip(_ARRAYS, own, strict=True)))
             # On the way back this runs again, outside of the caller's context.
             with part.in_order():
-                triangles = part.triangles(replace(Window.of(self.camera), first_row=begin, row_count=end - begin))
+                triangles = part.triangles(replace(Window.of(surfaces.camera), first_row=begin, row_count=end - begin))
                 inside = counts[begin * width : end * width]
                 coverage = store_coverage(self.scene, self.camera, part, triangles, inside, budget, sort=True)
-                fragments = coverage.shade_surfaces(part, moved=False)
-                return self._composite(fragments, _rows(band_beta, begin, end))
+                return self._composite(coverage, part, _rows(band_beta, begin, end))
 
         inputs = (*(getattr(surfaces, name) for name in _ARRAYS), beta)
         if not surfaces.kind.records(array for array in inputs if kind_of(array) is surfaces.kind):
@@ -225,6 +238,7 @@ def render(
     merge: Merge | None = None,
     mix: Mix | None = None,
     background: bool = True,
+    bounds: Bounds = "clamp",
     memory_limit: float | None = None,
 ) -> Any:
     """Render a scene: capture its fragments, merge them into layers, and composite those.
@@ -246,6 +260,8 @@ def render(
         merge: see `resolve`; default the scene's.
         mix: see `resolve`; default the scene's.
         background: whether to composite over the scene's background.
+        bounds: what becomes of parameters out of their range: "clamp" puts them on its end, with a gradient that leads
+            back in but not farther out; "error" refuses them.
         memory_limit: most memory that fragments and their gradients may take [bytes]; default half of what is free.
 
     Returns:
@@ -269,6 +285,7 @@ def render(
         merge=merge,
         mix=mix,
         background=background,
+        bounds=bounds,
         memory_limit=memory_limit,
     )
     return renderer.image(parameters)

@@ -177,7 +177,7 @@ def test_memory_does_not_grow_with_layers(monkeypatch):
     # Beside the layers: corners and boxes of 400 triangles.
     assert sum(many) == 64 * 48 * (6 * 28 + 4) + 400 * (12 + 16)
     assert kbuffer_bytes(64 * 48, 6) == 64 * 48 * (6 * 28 + 4)
-    assert kbuffer_bytes(10, 8, wp.float64, words=4) == 10 * (8 * 56 + 4 + 16 + 16 + 4)
+    assert kbuffer_bytes(10, 8, wp.float64, map_words=4) == 10 * (8 * 56 + 4 + 16 + 16 + 4)
 
 
 def test_nothing_in_view():
@@ -197,12 +197,12 @@ def test_arguments_are_checked():
         capture_kbuffer("scene.toml")
     with pytest.raises(ValueError, match="slots: got -1"):
         capture_kbuffer(setting, slots=-1)
-    with pytest.raises(ValueError, match="cull: got 'occupancy' with merge='order_independent' and tail='mix'"):
+    with pytest.raises(ValueError, match='cull: got "occupancy" with merge="order_independent" and tail="mix"'):
         capture_kbuffer(setting, cull="occupancy")
     plain = {"merge": "none", "tail": "discard"}
-    with pytest.raises(ValueError, match="cull: got 'early'"):
+    with pytest.raises(ValueError, match='cull: got "early"'):
         capture_kbuffer(setting, cull="early", **plain)
-    with pytest.raises(ValueError, match="words: got 1, expected more than 1, for 32 slots"):
+    with pytest.raises(ValueError, match="words: got 1, expected a whole number of at least 2"):
         capture_kbuffer(setting, slots=32, cull="occupancy", words=1, **plain)
     with pytest.raises(
         MemoryError, match=r"8 slots for each of 200 pixels would take 44\.53 KiB, expected at most 1000 B"

@@ -125,6 +125,21 @@ def test_thickness_in_multiples_of_depth_resolution():
     np.testing.assert_allclose(found.thickness.reshape(10, 16, 2), expected, rtol=1e-6)
 
 
+def test_thickness_in_multiples_of_an_orthographic_depth_resolution():
+    """There P is (far − near)·2^−24 at every depth: the slope is zero, a factor's derivative P itself."""
+    objects = [quad(2.0, thickness=2.0, thickness_unit="P"), quad(3.0, name="b", thickness=10.0, thickness_unit="P")]
+    camera = orthographic((6, 4))
+    setting = scene(camera, *objects)
+    p = (camera.far - camera.near) * 2.0**-24
+    found = capture(setting)
+    np.testing.assert_allclose(found.thickness, np.where(found.object_id == 0, 2.0, 10.0) * p, rtol=1e-6)
+    values = leaves(setting, "quad.vertices", "b.thickness")
+    thickness = capture(setting, parameters=values).thickness
+    by_vertex, by_factor = torch.autograd.grad(thickness.sum(), list(values.values()))
+    assert by_vertex.abs().max() < 1e-12 * p
+    assert by_factor.sum().item() == pytest.approx(24 * p)
+
+
 @pytest.mark.parametrize("kind", ["numpy", "torch"])
 def test_precision_follows_the_parameters(kind):
     """float64 parameters give float64 fragments, equal to the float32 ones up to rounding."""

@@ -148,7 +148,7 @@ def _backward(
         return
     fragment_size = fragment_bytes(inputs.points.dtype, gradient=True)
     allowed = max(BAND_BYTES, int(row_counts.max()) * fragment_size)
-    for begin, end in split_rows(row_counts, 0.0, fragment_size, allowed):
+    for begin, end in split_rows(row_counts, row_counts * fragment_size, allowed):
         pixels = slice(begin * options.width, end * options.width)
         band = replace(options, first_row=options.first_row + begin, row_count=end - begin)
         own = {name: None if grad is None else grad[pixels] for name, grad in vars(grads).items()}
@@ -246,7 +246,7 @@ def capture_kbuffer(
     surfaces = surfaces_of(scene, camera, parameters)
     options = {"slots": int(slots), "merge": merge, "tail": tail, "map_words": map_words}
     with surfaces.in_order():
-        return kbuffer_of_surfaces(surfaces, Window.of(camera), memory_limit, **options)
+        return kbuffer_of_surfaces(surfaces, Window.of(surfaces.camera), memory_limit, **options)
 
 
 def kbuffer_of_surfaces(
@@ -317,7 +317,7 @@ def count_culled(
     camera = check_scene(scene, camera)
     map_words = _check_options(slots, merge, tail, cull, words)
     surfaces = surfaces_of(scene, camera, parameters)
-    window = Window.of(camera)
+    window = Window.of(surfaces.camera)
     options = BoundedWindow(**asdict(window), slots=int(slots), merge=merge, tail=tail, map_words=map_words)
     kind, arrays = surfaces.kind, operator_arrays(surfaces)
     for name in ("points", "rgba", "thickness", "maps"):

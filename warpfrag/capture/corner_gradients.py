@@ -238,7 +238,7 @@ def fragment_adjoint(
             if triangle.map >= 0:
                 factor = map_thickness(surface, triangle.map, pixel)
             depth = hit[2] * along
-            slope = depth_resolution_slope(depth, rays.near, rays.far, DEPTH_STEP)
+            slope = depth_resolution_slope(depth, rays.near, rays.far, DEPTH_STEP, rays.perspective)
             grad_depth += grad_own * factor * slope
             grad_own *= thickness_scale(depth, triangle.in_p, rays)
         if triangle.map < 0:

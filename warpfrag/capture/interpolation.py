@@ -54,7 +54,7 @@ def premultiplied(l_b: wp.float64, l_c: wp.float64, a: wp.vec4d, b: wp.vec4d, c:
 def thickness_scale(depth: wp.float64, in_p: int, rays: Rays) -> wp.float64:
     """Return the unit of a thickness: 1, or P(depth)."""
     if in_p != 0:
-        return depth_resolution(depth, rays.near, rays.far, DEPTH_STEP)
+        return depth_resolution(depth, rays.near, rays.far, DEPTH_STEP, rays.perspective)
     return ONE
 
 

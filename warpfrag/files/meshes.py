@@ -91,7 +91,8 @@ def _read(path: str | os.PathLike, root: str | os.PathLike | None, *, split: boo
         reason = words if isinstance(error, (ValueError, OSError)) else f"{type(error).__name__}: {words}"
         left_out = f": {source.wording()}" if source.wording() else ""
         kind = "USD" if suffix in USD_SUFFIXES else suffix[1:]
-        raise ValueError(f"got a {kind} file that cannot be read: {name} ({reason}){left_out}") from error
+        article = "an" if kind in ("obj", "stl", "off") else "a"
+        raise ValueError(f"got {article} {kind} file that cannot be read: {name} ({reason}){left_out}") from error
     if not parts:
         raise ValueError(f"got no faces in {name}{holds}, expected a mesh with triangles")
     source.warn()
