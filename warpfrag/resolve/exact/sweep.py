@@ -184,9 +184,9 @@ def in_progress(sweep: Any, count: int):
 
 @wp.func(inline=True)
 def enter_front(sweep: Any, scratch: Any, base: int, count: int):
-    """Return the sweep with the slab active that begins where the interval does, if one does; with its `last` back."""
+    """Return the sweep with the slab active whose front begins the interval, if one does."""
     at = int(sweep.following)
-    if at < count and front(scratch.fragment[base + at]) == sweep.begin:
+    if at < count and sweep.begin_boundary == 2 * at:
         scratch.active[base + sweep.active] = at
         sweep.active += 1
         sweep.following = at + 1
