@@ -20,6 +20,7 @@ from warpfrag.storage.method import (
     fill,
     for_each_pixel,
     offsets_of,
+    scan_counts,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -219,3 +220,9 @@ def test_room_is_told_before_anything_is_allocated():
     with pytest.raises(MemoryError, match="no"):
         fill(DYNAMIC, triangles, room_for(triangles, refuse))
     assert told == [(96 * (4 + 4), "96 fragments", 96)]
+
+
+def test_too_many_fragments_for_offsets_are_refused():
+    """More fragments than int32 counts are an error, not an overflow."""
+    with pytest.raises(ValueError, match="4294967294 fragments, expected at most 2147483647"):
+        scan_counts(wp.array(np.full(2, 2**31 - 1, np.int32), device="cpu"))
