@@ -91,6 +91,7 @@ class Renderer:
             check_kbuffer(self.max_layers, self.merge, "mix")
         else:
             check_options(self.merge, self.mix, self.max_layers)
+        self.max_layers = int(self.max_layers)
         self._tables: SurfaceTables | None = None
         self._coverage: Coverage | None = None
         self._sizes: CaptureSizes | None = None
@@ -188,8 +189,15 @@ class Renderer:
         if self.resolve == "kbuffer":
             layers = kbuffer(coverage.shade_surfaces(surfaces, moved=False), self.max_layers, merge=self.merge)  # type: ignore[arg-type]
             return self._over_background(composite(layers))
-        options = {"max_layers": self.max_layers, "merge": self.merge, "mix": self.mix}
-        return self._over_background(composite(coverage.shade_surfaces(surfaces, moved=False), beta, **options))
+        return self._over_background(
+            composite(
+                coverage.shade_surfaces(surfaces, moved=False),
+                beta,
+                max_layers=self.max_layers,
+                merge=self.merge,
+                mix=self.mix,
+            )
+        )
 
     def _over_background(self, image: Any) -> Any:
         return over_background(image, self.scene.background) if self.background else image

@@ -244,9 +244,16 @@ def capture_kbuffer(
     camera = check_scene(scene, camera)
     map_words = _check_options(slots, merge, tail, cull, words)
     surfaces = surfaces_of(scene, camera, parameters)
-    options = {"slots": int(slots), "merge": merge, "tail": tail, "map_words": map_words}
     with surfaces.in_order():
-        return kbuffer_of_surfaces(surfaces, Window.of(surfaces.camera), memory_limit, **options)
+        return kbuffer_of_surfaces(
+            surfaces,
+            Window.of(surfaces.camera),
+            memory_limit,
+            slots=int(slots),
+            merge=merge,
+            tail=tail,
+            map_words=map_words,
+        )
 
 
 def kbuffer_of_surfaces(
