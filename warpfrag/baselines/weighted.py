@@ -64,7 +64,7 @@ def _falloff(xp: Any, depth: Any, equation: int, near: float, far: float) -> Any
         if far <= near:
             # All at the same depth are at its front.
             return 3e3 + 0.0 * depth
-        # Depth in the window of a perspective camera, 1 - d. Relative to the near plane, so that no square of it overflows.
+        # Depth in the window of a perspective camera, 1 - d. In units of the near plane no square overflows.
         relative = xp.clip(depth, near, min(far, _FARTHEST * near)) / near
         clear = (1.0 / relative - near / far) / (1.0 - near / far)
         return xp.clip(3e3 * clear**3, 1e-2, 3e3)
