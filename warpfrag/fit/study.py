@@ -1,5 +1,6 @@
 """Studies: what is fitted to which images, and how. `study_file` reads them from TOML."""
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -34,6 +35,8 @@ DEFAULT_STEPS: dict[Method, int] = {"least_squares": 100, "adam": 300, "lbfgs": 
 # Adam stops when the best loss of so many steps is not better than the best before them, L-BFGS after so many steps in
 # a row that changed nothing.
 DEFAULT_PATIENCE: dict[Method, int] = {"least_squares": 1, "adam": 50, "lbfgs": 3}
+# More are a slip of the keyboard: each restart is a fit of its own, and the pyramid of any image ends before.
+MOST_RESTARTS, MOST_SCALES = 10_000, 64
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -121,8 +124,8 @@ class Study:
         if self.method is not None:
             check_choice("method", self.method, get_args(Method))
         check_choice("resolve", self.resolve, get_args(Resolve))
-        for key, least in (("seed", 0), ("restarts", 0), ("scales", 1)):
-            check_whole(key, getattr(self, key), least)
+        for key, least, most in (("seed", 0, math.inf), ("restarts", 0, MOST_RESTARTS), ("scales", 1, MOST_SCALES)):
+            check_whole(key, getattr(self, key), least, most)
         for key in ("steps", "patience", "batch"):
             if getattr(self, key) is not None:
                 check_whole(key, getattr(self, key), 1)
