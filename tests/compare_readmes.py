@@ -31,11 +31,11 @@ def read_numbers(folder: str | os.PathLike) -> dict[str, float]:
     try:
         numbers = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise SummaryError(f"{path}: found no file that can be read, expected the study's numbers") from error
+        raise SummaryError(f"{path}: got no file that can be read, expected the study's numbers") from error
     except ValueError as error:
-        raise SummaryError(f"{path}: found no JSON ({error}), expected the study's numbers") from error
+        raise SummaryError(f"{path}: got no JSON ({error}), expected the study's numbers") from error
     if not isinstance(numbers, dict) or not all(type(value) in (int, float) for value in numbers.values()):
-        raise SummaryError(f"{path}: found something else, expected numbers by name")
+        raise SummaryError(f"{path}: got something else, expected numbers by name")
     return numbers
 
 
@@ -52,17 +52,17 @@ def differences(
 
     Example:
         >>> differences({"error": 0.10, "found": 8}, {"error": 0.12, "found": 8}, 0.05)
-        ['error: found 0.12, expected 0.1 within 5 %']
+        ['error: got 0.12, expected 0.1 within 5 %']
     """
     lines = []
     for name in sorted({*committed, *regenerated}):
         if name not in regenerated:
-            lines.append(f"{name}: found none, expected {committed[name]:g}")
+            lines.append(f"{name}: got none, expected {committed[name]:g}")
         elif name not in committed:
-            lines.append(f"{name}: found {regenerated[name]:g}, expected no such number")
+            lines.append(f"{name}: got {regenerated[name]:g}, expected no such number")
         elif not math.isclose(committed[name], regenerated[name], rel_tol=tolerance, abs_tol=floor):
             lines.append(
-                f"{name}: found {regenerated[name]:g}, expected {committed[name]:g} within {100 * tolerance:g} %"
+                f"{name}: got {regenerated[name]:g}, expected {committed[name]:g} within {100 * tolerance:g} %"
             )
     return lines
 
@@ -80,20 +80,20 @@ def text_differences(committed: str, regenerated: str, tolerance: float) -> list
     """
     old, new = _lines(committed), _lines(regenerated)
     if len(old) != len(new):
-        return [f"text: found {len(new)} lines, expected {len(old)}"]
+        return [f"text: got {len(new)} lines, expected {len(old)}"]
     lines = []
     for before, after in zip(old, new, strict=True):
         words_before, words_after = _NUMBER.split(before), _NUMBER.split(after)
         # Split by a group, words stand at even places, and numbers at odd ones.
         if [word.split() for word in words_before[::2]] != [word.split() for word in words_after[::2]]:
-            lines.append(f'text: found "{after}", expected "{before}"')
+            lines.append(f'text: got "{after}", expected "{before}"')
             continue
         for place in range(1, len(words_before), 2):
             if _TIME.match(words_before[place + 1]):
                 continue
             if not _same(words_before[place], words_after[place], tolerance):
                 expected = f"{words_before[place]} within {100 * tolerance:g} %"
-                lines.append(f'text: found {words_after[place]}, expected {expected} in "{before}"')
+                lines.append(f'text: got {words_after[place]}, expected {expected} in "{before}"')
     return lines
 
 

@@ -111,7 +111,7 @@ def shorten(value: Any, limit: int = 60) -> str:
         plain = given.item() if hasattr(given, "item") else given
         # Python refuses to write whole numbers of thousands of digits.
         if isinstance(plain, int) and abs(plain) >= 10**limit:
-            return f"a whole number of {int(plain.bit_length() * math.log10(2.0)) + 1} digits or so"
+            return f"a whole number of about {round(math.log10(abs(plain)))} digits"
         if isinstance(plain, str):
             text = '"' + plain.replace("\n", "\\n").replace("\0", "\\0") + '"'
         else:

@@ -19,7 +19,9 @@ from warpfrag.raster.ray import Window
 from warpfrag.resolve.options import check_options
 from warpfrag.scene.camera import Camera
 from warpfrag.scene.names import Merge, Mix
+from warpfrag.scene.parameters import Bounds, bounded_beta
 from warpfrag.scene.scene import Scene
+from warpfrag.scene.visibility import warn_if_empty
 from warpfrag.storage.into_slots import check_kbuffer, kbuffer_bytes
 from warpfrag.storage.kbuffer import kbuffer
 from warpfrag.storage.method import count_fragments
@@ -52,6 +54,7 @@ class Renderer:
         merge: see `resolve` or `kbuffer`; default the scene's.
         mix: see `resolve`; default the scene's. A k-buffer has none.
         background: whether to composite over the scene's background.
+        bounds: see `render`.
         memory_limit: see `render`.
 
     Raises:
@@ -75,13 +78,14 @@ class Renderer:
         merge: Merge | None = None,
         mix: Mix | None = None,
         background: bool = True,
+        bounds: Bounds = "clamp",
         memory_limit: float | None = None,
     ):
         self.camera = check_scene(scene, camera)
         self.scene, self.resolve, self.beta = scene, resolve, beta
         self.max_layers = scene.layers if max_layers is None else max_layers
         self.merge, self.mix = merge or scene.merge, mix or scene.mix
-        self.background, self.memory_limit = background, memory_limit
+        self.background, self.bounds, self.memory_limit = background, bounds, memory_limit
         check_choice("resolve", resolve, get_args(Resolve))
         if resolve == "kbuffer":
             check_kbuffer(self.max_layers, self.merge, "mix")
@@ -128,19 +132,20 @@ class Renderer:
         if kind is not None and kind.name == "warp":
             raise TypeError("beta: got a wp.array, expected a number, a NumPy array or a torch.Tensor")
         surfaces = self._surfaces(values)
-        beta = _beta_like(values.get("beta", self.scene.beta), surfaces)
+        beta = bounded_beta(_beta_like(values.get("beta", self.scene.beta), surfaces), self.bounds)
         with surfaces.in_order():
             found = self._cover(surfaces)
             if isinstance(found, Coverage):
+                warn_if_empty(found.count, self.scene, self.camera)
                 return self._composite(found, surfaces, beta)
             if self.resolve == "sorted":
                 return self._image_in_bands(surfaces, found, beta)
-            window, limit = Window.of(self.camera), self.memory_limit
+            window, limit = Window.of(surfaces.camera), self.memory_limit
             layers = kbuffer_of_surfaces(surfaces, window, limit, slots=self.max_layers, merge=self.merge, tail="mix")
             return self._over_background(composite(layers))
 
     def _surfaces(self, parameters: Mapping[str, Any]) -> CameraSurfaces:
-        surfaces = surfaces_of(self.scene, self.camera, parameters, self._tables)
+        surfaces = surfaces_of(self.scene, self.camera, parameters, self._tables, bounds=self.bounds)
         self._tables = surfaces.tables
         return surfaces
 
@@ -160,7 +165,7 @@ class Renderer:
                 self._coverage = kept.to(surfaces.device)
                 return self._coverage
             self._coverage = None
-        triangles = surfaces.triangles(Window.of(self.camera))
+        triangles = surfaces.triangles(Window.of(surfaces.camera))
         self._sizes = CaptureSizes.of(triangles, surfaces)
         budget, counts = self._budget(surfaces), count_fragments(triangles)
         row_counts = counts.numpy().reshape(self.camera.shape).sum(axis=1, dtype=np.int64)
@@ -169,7 +174,7 @@ class Renderer:
         # The old one goes before the new one comes.
         self._coverage = kept = None
         self._coverage = store_coverage(
-            self.scene, self.camera, surfaces, triangles, counts, budget, sort=self.resolve == "sorted"
+            self.scene, surfaces.camera, surfaces, triangles, counts, budget, sort=self.resolve == "sorted"
         )
         return self._coverage
 
@@ -212,7 +217,7 @@ class Renderer:
             part = replace(surfaces, **dict(zip(_ARRAYS, own, strict=True)))
             # On the way back this runs again, outside of the caller's context.
             with part.in_order():
-                triangles = part.triangles(replace(Window.of(self.camera), first_row=begin, row_count=end - begin))
+                triangles = part.triangles(replace(Window.of(surfaces.camera), first_row=begin, row_count=end - begin))
                 inside = counts[begin * width : end * width]
                 coverage = store_coverage(self.scene, self.camera, part, triangles, inside, budget, sort=True)
                 return self._composite(coverage, part, _rows(band_beta, begin, end))
@@ -241,6 +246,7 @@ def render(
     merge: Merge | None = None,
     mix: Mix | None = None,
     background: bool = True,
+    bounds: Bounds = "clamp",
     memory_limit: float | None = None,
 ) -> Any:
     """Render a scene: capture its fragments, merge them into layers, and composite those.
@@ -262,6 +268,8 @@ def render(
         merge: see `resolve`; default the scene's.
         mix: see `resolve`; default the scene's.
         background: whether to composite over the scene's background.
+        bounds: what becomes of parameters out of their range: "clamp" puts them on its end, with a gradient that leads
+            back in but not farther out; "error" refuses them.
         memory_limit: most memory that fragments and their gradients may take [bytes]; default half of what is free.
 
     Returns:
@@ -285,6 +293,7 @@ def render(
         merge=merge,
         mix=mix,
         background=background,
+        bounds=bounds,
         memory_limit=memory_limit,
     )
     return renderer.image(parameters)

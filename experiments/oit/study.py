@@ -251,10 +251,10 @@ def _passes(scene: wf.Scene, repetitions: int) -> dict[str, Any]:
         }.items()
     }
     fragment_count = 0
-    place, _ = _timed(lambda: place_surfaces(assemble(scene), scene.camera))
+    place, _ = _timed(lambda: place_surfaces(assemble(scene)))
     for _ in range(repetitions):
         times: dict[str, dict[str, float]] = {way: {} for way in taken}
-        surfaces = place_surfaces(assemble(scene), scene.camera)
+        surfaces = place_surfaces(assemble(scene))
         count, (_, fragment_count) = _timed(lambda s=surfaces: scan_counts(count_fragments(s.triangles(window))))
         del surfaces
         capture, fragments = _timed(lambda: wf.capture(scene, sort=False))

@@ -11,7 +11,8 @@ import shapes
 import warpfrag as wf
 from warpfrag.files.meshes import load_mesh, warp_asset
 from warpfrag.files.points import POINT_SUFFIXES, load_points
-from warpfrag.shapes.mesh import Mesh, lambert, smooth_normals
+from warpfrag.scene.light import lambert
+from warpfrag.shapes.mesh import Mesh, smooth_normals
 from warpfrag.shapes.surfels import PointSet, surfels
 
 SCENES = Path(__file__).parents[2] / "scenes"

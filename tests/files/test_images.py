@@ -1,9 +1,12 @@
 """Images to files and back."""
 
+import struct
+import zlib
+
 import numpy as np
 import png
 import pytest
-from PIL import Image
+from PIL import Image, ImageCms
 
 from warpfrag.colors import encode, linear_to_srgb
 from warpfrag.files.images import ImageError, read_image, write_image
@@ -136,3 +139,101 @@ def test_nothing_half_written_stays(tmp_path, image, monkeypatch):
         write_image(tmp_path / "a.png", 0.5 * image)
     assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
     assert (tmp_path / "a.png").read_bytes() == before
+
+
+def png_with(*chunks, value=128, bits=8):
+    """Return a PNG of one grey RGB pixel with these chunks before it."""
+
+    def chunk(name, data):
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", 1, 1, bits, 2, 0, 0, 0))
+    pixel = struct.pack(">B3B" if bits == 8 else ">B3H", 0, value, value, value)
+    body = b"".join(chunk(*each) for each in chunks) + chunk(b"IDAT", zlib.compress(pixel)) + chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + header + body
+
+
+def gama(value):
+    """Return a gAMA chunk."""
+    return b"gAMA", struct.pack(">I", value)
+
+
+@pytest.mark.parametrize(
+    ("chunks", "expected"),
+    [
+        ((), 0.2158605),
+        ((gama(100000),), 128 / 255),
+        ((gama(45455),), (128 / 255) ** 2.2),
+        ((gama(100000), (b"sRGB", b"\0")), 0.2158605),
+        ((gama(0),), 0.2158605),
+        (((b"cICP", bytes([1, 8, 0, 1])), gama(45455)), 128 / 255),
+        (((b"cICP", bytes([1, 13, 0, 1])), gama(100000)), 0.2158605),
+        (((b"cICP", bytes([1, 4, 0, 1])),), (128 / 255) ** 2.2),
+    ],
+)
+@pytest.mark.parametrize("bits", [8, 16])
+def test_chunks_say_what_the_numbers_mean(tmp_path, chunks, expected, bits):
+    """CICP comes before sRGB, sRGB before gAMA; without any of them it is sRGB."""
+    (tmp_path / "a.png").write_bytes(png_with(*chunks, value=128 if bits == 8 else 128 * 257, bits=bits))
+    np.testing.assert_allclose(read_image(tmp_path / "a.png"), [[[expected] * 3]], rtol=2e-5)
+
+
+def test_colour_spaces_that_are_not_read_are_refused(tmp_path):
+    """High dynamic range and wide gamuts are named, not taken for sRGB."""
+    for content, words in ((bytes([1, 16, 0, 1]), r"transfer function 16 \(PQ\)"), (bytes([9, 13, 0, 1]), "9/0/1")):
+        (tmp_path / "a.png").write_bytes(png_with((b"cICP", content)))
+        with pytest.raises(ImageError, match=rf"a.png: got the .*{words}"):
+            read_image(tmp_path / "a.png")
+
+
+def test_colour_profiles_are_applied(tmp_path):
+    """An sRGB profile changes nothing."""
+    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    for name in ("a.png", "a.jpg"):
+        Image.new("RGB", (4, 4), (128, 128, 128)).save(tmp_path / name, icc_profile=profile)
+        np.testing.assert_allclose(read_image(tmp_path / name)[0, 0], [0.2158605] * 3, atol=3e-3)
+
+
+def test_jpeg_references(tmp_path):
+    """A JPEG is read upright, as sRGB; it cannot be written."""
+    picture = Image.new("RGB", (16, 8), (255, 0, 0))
+    picture.paste((0, 0, 255), (0, 0, 8, 8))
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    picture.save(tmp_path / "a.jpg", quality=95, subsampling=0, exif=exif)
+    found = read_image(tmp_path / "a.jpg", size=(8, 16))
+    np.testing.assert_allclose(found[2, 4], [0, 0, 1], atol=0.02)
+    np.testing.assert_allclose(found[13, 4], [1, 0, 0], atol=0.02)
+    with pytest.raises(ImageError, match=r"expected one of .png, .exr, .npy$"):
+        write_image(tmp_path / "b.jpg", found)
+
+
+def test_parts_of_openexr_files(tmp_path):
+    """Of several parts the one with colours is read; without any, all are named."""
+    openexr = pytest.importorskip("OpenEXR", reason="OpenEXR is not installed")
+    values = np.full((2, 3), 0.25, np.float32)
+
+    def part(name, channels):
+        return openexr.Part({"type": openexr.scanlineimage, "name": name}, channels, name)
+
+    with openexr.File([part("depth", {"Z": values}), part("rgb", dict.fromkeys("RGB", values))]) as file:
+        file.write(str(tmp_path / "a.exr"))
+    np.testing.assert_array_equal(read_image(tmp_path / "a.exr"), np.full((2, 3, 3), 0.25))
+    with openexr.File([part("depth", {"Z": values}), part("id", {"I": values})]) as file:
+        file.write(str(tmp_path / "a.exr"))
+    with pytest.raises(ImageError, match=r'a.exr: got the parts "depth" with Z; "id" with I, expected R, G, B'):
+        read_image(tmp_path / "a.exr")
+
+
+def test_deep_openexr_files_are_named(tmp_path):
+    """A deep image is refused as such."""
+    openexr = pytest.importorskip("OpenEXR", reason="OpenEXR is not installed")
+    samples = np.empty((1, 2), dtype=object)
+    samples[0, 0], samples[0, 1] = np.ones(2, np.float32), np.ones(1, np.float32)
+    header = {"compression": openexr.ZIPS_COMPRESSION, "type": openexr.deepscanline}
+    with openexr.File(header, {name: samples.copy() for name in "RGBAZ"}) as file:
+        file.write(str(tmp_path / "a.exr"))
+    with pytest.raises(
+        ImageError, match=r"a.exr: got a deep image, whose pixels have several samples, expected a flat"
+    ):
+        read_image(tmp_path / "a.exr")

@@ -224,6 +224,7 @@ def Xform "root"
         point3f[] points = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0.5, 2, 0)]
         int[] faceVertexCounts = [4, 3]
         int[] faceVertexIndices = [0, 1, 2, 3, 3, 2, 4]
+        uniform token subdivisionScheme = "none"
         %s
     }
 }

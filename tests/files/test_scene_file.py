@@ -5,10 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from gltf_files import write_gltf
 from PIL import Image
 
 from warpfrag.errors import SceneError
 from warpfrag.files.scene_file import load_scene
+from warpfrag.scene.assemble import assemble
+from warpfrag.scene.light import Light
 
 SCENES = sorted((Path(__file__).parents[2] / "scenes").glob("*.toml"))
 CAMERA = "[camera]\neye = [0, 0, 3]\ntarget = [0, 0, 0]\nfov = 45.0\n"
@@ -74,27 +77,34 @@ def test_transforms_scale_then_rotate_then_translate(tmp_path):
     np.testing.assert_array_equal(item.matrix @ [0, 1, 0, 1], [5, 6, 8, 1])
 
 
-def test_light_bakes_a_factor_per_vertex(tmp_path):
+def light_on(folder, body: str, head: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the factor of light on each vertex of a scene's only object, and the vertices' own z."""
+    scene = load_scene(write(folder, head + CAMERA + '[[object]]\nprimitive = "sphere"\n' + body))
+    (item,) = scene.objects
+    return assemble(scene).rgba[:, 0] / np.float32(item.color[0]), item.vertices[:, 2]
+
+
+def test_light_is_a_factor_per_vertex(tmp_path):
     """A light along z: the poles of a sphere get the ambient part alone, its front and back the full colour."""
-    item = only(tmp_path, "", "[light]\ndirection = [0, 0, 2]\nambient = 0.25\n")
-    expected = 0.25 + 0.75 * np.abs(item.vertices[:, 2])
-    np.testing.assert_allclose(item.shade, expected, atol=1e-6)
-    head = only(tmp_path, "translate = [0, 0, -50]\n", '[light]\ndirection = "camera"\n')
-    np.testing.assert_allclose(head.shade, 0.3 + 0.7 * np.abs(head.vertices[:, 2]), atol=0.03)
+    found, z = light_on(tmp_path, "", "[light]\ndirection = [0, 0, 2]\nambient = 0.25\n")
+    np.testing.assert_allclose(found, 0.25 + 0.75 * np.abs(z), atol=1e-6)
+    found, z = light_on(tmp_path, "translate = [0, 0, -50]\n", '[light]\ndirection = "camera"\n')
+    np.testing.assert_allclose(found, 0.3 + 0.7 * np.abs(z), atol=0.03)
 
 
 def test_flat_normals_split_the_vertices(tmp_path):
     """With `normals = "flat"` the three corners of a face have one factor and belong to it alone."""
-    item = only(tmp_path, 'normals = "flat"\n', "[light]\ndirection = [1, 2, 3]\n")
+    item = only(tmp_path, 'normals = "flat"\n')
     assert len(item.vertices) == 3 * len(item.faces)
-    assert np.ptp(item.shade.reshape(-1, 3), axis=1).max() == 0.0
+    assert np.ptp(item.normals.reshape(-1, 3, 3), axis=1).max() == 0.0
     cube = 'primitive = "cube"\nname = "{}"\n'
-    light = "[light]\ndirection = [1, 2, 3]\n"
+    light = Light((1, 2, 3))
     sharp, smooth = objects(
-        tmp_path, "[[object]]\n" + cube.format("a") + "[[object]]\n" + cube.format("b") + 'normals = "smooth"\n', light
+        tmp_path, "[[object]]\n" + cube.format("a") + "[[object]]\n" + cube.format("b") + 'normals = "smooth"\n'
     )
-    assert len(np.unique(sharp.shade)) == 3
-    assert len(np.unique(smooth.shade.round(6))) == 4
+    for each, count in ((sharp, 3), (smooth, 4)):
+        factor = light.factor(each.normals, each.world_vertices(), load_scene(tmp_path / "scene.toml").camera)
+        assert len(np.unique(factor.round(6))) == count
 
 
 def test_texture_key(tmp_path):
@@ -115,8 +125,9 @@ def test_shipped_scenes_load(path):
     scene = load_scene(path)
     assert path.read_text().startswith("# ")
     assert scene.camera.size == (512, 512)
+    assert scene.light is not None
     for item in scene.objects:
-        assert item.shade.min() >= 0.3
+        assert item.normals is not None
         x, y, z = (np.c_[item.world_vertices(), np.ones(len(item.vertices))] @ scene.camera.view_matrix().T).T[:3]
         assert z.min() > scene.camera.near
         assert z.max() < scene.camera.far
@@ -244,3 +255,40 @@ def test_paths_below_and_through_the_folder_are_fine(tmp_path):
     os.symlink(tmp_path / "real", tmp_path / "alias")
     for text in ("sub/tri.obj", "sub/../sub/tri.obj"):
         assert objects(tmp_path / "alias", f'[[object]]\nmesh = "{text}"\n')[0].name == "tri"
+
+
+def two_nodes(folder, **names):
+    """Write a glTF of two triangles under two nodes, one above the other."""
+    face = np.array([0, 1, 2], "u2")
+    nodes = [{"mesh": 0, "name": "box"}, {"mesh": 0, "name": "lid", "translation": [0, 0, 1]}]
+    primitive = {"attributes": {"POSITION": 0}, "indices": 1}
+    triangle = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "f4")
+    return write_gltf(folder, [triangle, face], primitive, nodes=nodes, scenes=[{"nodes": [0, 1]}], **names)
+
+
+def test_nodes_are_objects_of_their_own(tmp_path):
+    """With `split` each node is an object with its name, and may have a thickness of its own."""
+    two_nodes(tmp_path)
+    keys = '[[object]]\nmesh = "a.gltf"\nsplit = "nodes"\ntranslate = [5, 0, 0]\n'
+    box, lid = objects(tmp_path, keys + 'thickness = { box = 0.25, lid = "3P" }\n')
+    assert (box.name, box.thickness, box.thickness_unit) == ("box", 0.25, "scene")
+    assert (lid.name, lid.thickness, lid.thickness_unit) == ("lid", 3.0, "P")
+    np.testing.assert_allclose(lid.world_vertices()[0], [5, 0, 1])
+    assert [item.name for item in objects(tmp_path, keys + 'name = "case"\n')] == ["case.box", "case.lid"]
+    with pytest.raises(SceneError, match=r'thickness.lit: got an unknown name, .*did you mean "lid"'):
+        objects(tmp_path, keys + "thickness = { lit = 1 }\n")
+    (whole,) = objects(tmp_path, '[[object]]\nmesh = "a.gltf"\n')
+    assert (whole.name, len(whole.faces)) == ("a", 2)
+
+
+def test_groups_are_objects_of_their_own(tmp_path):
+    """Groups of an obj file likewise; what has no name has that of the file."""
+    write(tmp_path, "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\ng left\nf 1 2 3\ng right\nf 3 2 1\n", "tri.obj")
+    items = objects(tmp_path, '[[object]]\nmesh = "tri.obj"\nsplit = "groups"\nthickness = 0.5\n')
+    assert [(item.name, item.thickness) for item in items] == [("tri", 0.5), ("left", 0.5), ("right", 0.5)]
+
+
+def test_objects_that_nobody_has_named_are_numbered(tmp_path):
+    """Two spheres without names are told apart; a name that is given twice is refused."""
+    items = objects(tmp_path, '[[object]]\nprimitive = "sphere"\n' * 2 + '[[object]]\nprimitive = "cube"\n')
+    assert [item.name for item in items] == ["sphere", "sphere 2", "cube"]

@@ -7,6 +7,7 @@ import pytest
 from small_scene import spheres
 
 import warpfrag as wf
+from warpfrag.capture.bounded import capture_kbuffer
 from warpfrag.fit import FitParameter, Reference, Study, StudyError, fit
 from warpfrag.fit.jacobian import Evaluation
 from warpfrag.fit.losses import RobustLoss
@@ -26,7 +27,7 @@ def test_image_is_that_of_the_bounded_capture():
     study = make_study()
     problem = Problem(study)
     values = {name: np.float32(value) for name, value in problem.values(problem.start()).items()}
-    layers = wf.capture_kbuffer(study.scene, slots=3, parameters=values)
+    layers = capture_kbuffer(study.scene, slots=3, parameters=values)
     view = problem.views[0]
     image = view.over_background(wf.composite(layers))
     np.testing.assert_allclose(view.image(values), image, atol=2e-6)

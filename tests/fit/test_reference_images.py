@@ -3,7 +3,6 @@
 Every image is 3 × 2 pixels. A file is named in a study file, which is loaded and made ready to be fitted.
 """
 
-import io
 import struct
 import zlib
 
@@ -77,7 +76,7 @@ def refused(folder, image: str, background: str = OPAQUE) -> str:
     message, path = str(caught.value).removeprefix(f"{folder / 'study.toml'}: "), str(folder / image)
     assert "\n" not in message
     assert message.startswith(f"{path}: ")
-    return message.removeprefix(f"{path}: ").replace("found ", "got ", 1)
+    return message.removeprefix(f"{path}: ")
 
 
 def save(folder, stored: np.ndarray, mode: str | None = None, **options) -> str:
@@ -242,17 +241,18 @@ def test_files_that_are_no_images(folder):
     (folder / "folder.png").mkdir()
     assert refused(folder, "folder.png") == "got a folder, expected an image"
     (folder / "empty.png").write_bytes(b"")
-    assert refused(folder, "empty.png") == "got what is not a PNG file, expected one"
-    jpeg = io.BytesIO()
-    Image.fromarray(RGB).save(jpeg, "JPEG")
-    (folder / "photo.png").write_bytes(jpeg.getvalue())
-    assert refused(folder, "photo.png") == "got what is not a PNG file, expected one"
-    (folder / "photo.jpg").write_bytes(jpeg.getvalue())
-    assert refused(folder, "photo.jpg") == "got the suffix .jpg, expected one of .png, .exr, .npy"
-    assert refused(folder, "photo") == "got no suffix, expected one of .png, .exr, .npy"
+    assert refused(folder, "empty.png").startswith("got an image that cannot be read")
+    assert refused(folder, "photo").startswith("got no suffix, expected one of ")
     for name in ("empty.exr", "empty.npy"):
         (folder / name).write_bytes(b"")
-        assert refused(folder, name).startswith("got a file that cannot be read")
+        assert refused(folder, name).startswith("got an image that cannot be read")
+
+
+def test_a_photo_is_read_by_what_it_is(folder):
+    """A JPEG has colours without opacity, under the name of a PNG as well."""
+    for name in ("photo.jpg", "photo.png"):
+        Image.fromarray(np.full((2, 3, 3), 128, np.uint8)).save(folder / name, "JPEG")
+        np.testing.assert_allclose(compared(folder, name), linear(np.full((2, 3, 3), 128)), atol=0.02)
 
 
 @pytest.mark.parametrize("kind", ["8 bit", "16 bit"])
@@ -284,7 +284,7 @@ def test_truncated_float_files_are_refused(folder, name):
     whole = (folder / name).read_bytes()
     for length in (len(whole) // 2, len(whole) - 8):
         (folder / name).write_bytes(whole[:length])
-        assert refused(folder, name).startswith("got a file that cannot be read")
+        assert refused(folder, name).startswith("got an image that cannot be read")
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -359,7 +359,7 @@ def test_name_must_be_text(folder, image):
     """The study file and the key are told."""
     (folder / "scene.toml").write_text(SCENE.format(background=OPAQUE))
     (folder / "study.toml").write_text(STUDY.format(image="").replace('image = ""', f"image = {image}"))
-    with pytest.raises(StudyError, match=r"study\.toml: reference\.image: (found|got)"):
+    with pytest.raises(StudyError, match=r"study\.toml: reference\.image: got"):
         load_study(folder / "study.toml")
 
 

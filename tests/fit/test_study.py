@@ -100,7 +100,7 @@ def test_reference_image(folder):
     assert study.reference.image is not None
     assert study.reference.image.shape == (16, 24, 3)
     assert study.prepared.true is None
-    with pytest.raises(ImageError, match=r"none\.png: (found|got) no such file"):
+    with pytest.raises(ImageError, match=r"none\.png: got no such file"):
         load(folder, text + '[reference]\nimage = "none.png"\n')
 
 
@@ -156,7 +156,7 @@ def test_mistakes_get_one_line(folder, old, new, words):
         text = 'method = "least_squares"\n' + text
     with pytest.raises(StudyError) as caught:
         load(folder, text)
-    message = str(caught.value).replace("found ", "got ", 1)
+    message = str(caught.value)
     assert words in message
     assert message.startswith(str(folder / "study.toml"))
     assert "\n" not in message

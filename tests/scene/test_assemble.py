@@ -80,7 +80,8 @@ def test_parameters_round_trip():
     parameters = scene.parameters()
     keys = ("thickness", "color", "opacity", "vertices", "translation", "rotation")
     names = {f"{name}.{key}" for name in ("tri", "square") for key in keys}
-    assert set(parameters) == {"beta", "camera.translation", "camera.rotation", *names}
+    cameras = {f"camera.{key}" for key in ("translation", "rotation", "fov", "principal")}
+    assert set(parameters) == {"beta", *cameras, *names}
     assert parameters["tri.opacity"] == 0.5
     same = assemble(scene, parameters)
     for name in ("vertices", "rgba", "thickness"):
@@ -160,7 +161,7 @@ def test_one_thickness_for_all_objects():
 def test_refused_overrides(overrides, error, words):
     """Names, kinds, shapes and ranges are checked, with what was got and what is expected."""
     with pytest.raises(error, match=words):
-        assemble(two_objects(), overrides)
+        assemble(two_objects(), overrides, bounds="error")
 
 
 @pytest.mark.parametrize(
@@ -214,7 +215,27 @@ def test_torch_overrides_keep_their_precision():
     with pytest.raises(ValueError, match=r"tri.opacity: got a torch.Tensor of float16"):
         assemble(scene, {"tri.opacity": torch.tensor(0.5, dtype=torch.float16)})
     with pytest.raises(ValueError, match=r"tri.opacity: got 2, expected numbers from 0 to 1"):
-        assemble(scene, {"tri.opacity": torch.tensor(2.0)})
+        assemble(scene, {"tri.opacity": torch.tensor(2.0)}, bounds="error")
+
+
+def test_values_out_of_range_are_clamped():
+    """Their gradient leads back in, and not farther out; what is not finite is refused all the same."""
+    torch = pytest.importorskip("torch")
+    for high in (1.5, torch.tensor(1.5)):
+        np.testing.assert_array_equal(np.asarray(assemble(two_objects(), {"tri.opacity": high}).rgba[:3, 3]), [1.0] * 3)
+    values = {"tri.color": [-0.25, 0.5, 3.0], "tri.opacity": 1.5, "square.thickness": -1.0}
+    leaves = {name: torch.tensor(value, requires_grad=True) for name, value in values.items()}
+    geometry = assemble(two_objects(), leaves)
+    np.testing.assert_array_equal(geometry.rgba[0].detach(), [0.0, 0.5, 3.0, 1.0])
+    for sign in (1.0, -1.0):
+        total = sign * (geometry.rgba[:3].sum() + geometry.thickness[3:].sum())
+        found = torch.autograd.grad(total, list(leaves.values()), retain_graph=True)
+        # Downhill is against the gradient: up for sign -1, down for sign 1.
+        inwards = {1.0: [[0, 3, 3], 3, 0], -1.0: [[-3, -3, -3], 0, -4]}[sign]
+        for grad, expected in zip(found, inwards, strict=True):
+            np.testing.assert_array_equal(grad, expected)
+    with pytest.raises(ValueError, match=r"tri\.thickness: got inf"):
+        assemble(two_objects(), {"tri.thickness": torch.tensor(np.inf)})
 
 
 @pytest.mark.parametrize("thickness", ["one", "vertex", "map"])

@@ -1,11 +1,18 @@
 """Cameras: conventions of camera space, sizes, and refusals."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from warpfrag.render import render
 from warpfrag.scene.camera import Camera
+from warpfrag.scene.rotation import rotation_matrix
+from warpfrag.scene.scene import Scene
+from warpfrag.scene.surface import SceneObject
+
+TRIANGLE = np.array([[-0.8, -0.6, 0.0], [0.9, -0.5, 0.2], [0.1, 0.8, -0.1]]), [[0, 1, 2]]
 
 
 def project(camera, point):
@@ -13,7 +20,7 @@ def project(camera, point):
     x, y, z = (camera.view_matrix() @ [*point, 1.0])[:3]
     width, height = camera.size
     if camera.is_perspective:
-        return x / z * camera.focal + width / 2, y / z * camera.focal + height / 2
+        return x / z * camera.focal + camera.middle[0], y / z * camera.focal + camera.middle[1]
     return x / camera.pixel_size + width / 2, y / camera.pixel_size + height / 2
 
 
@@ -89,3 +96,68 @@ def test_the_other_kind_of_camera_has_no_focal_or_pixel_size():
         _ = Camera(eye=(0, 0, 2), target=(0, 0, 0), height=1.0).focal
     with pytest.raises(ValueError, match="perspective camera has none"):
         _ = Camera(eye=(0, 0, 2), target=(0, 0, 0), fov=45.0).pixel_size
+
+
+def turned() -> np.ndarray:
+    """Return a rotation that is no special one."""
+    return rotation_matrix(np.array([20.0, -50.0, 130.0]))
+
+
+def test_camera_from_a_matrix():
+    """The matrix is the inverse of the view matrix, in either convention; lengths and far places keep their digits."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = turned(), [5e5, -4e6, 200.0]
+    camera = Camera.from_matrix(matrix, fov=50.0, size=(30, 20))
+    np.testing.assert_allclose(camera.view_matrix() @ matrix, np.eye(4), atol=1e-8)
+    np.testing.assert_allclose(camera.view_matrix()[:3, :3], turned().T, atol=1e-14)
+    opengl = matrix @ np.diag([1.0, -1.0, -1.0, 1.0])
+    assert Camera.from_matrix(opengl, axes="opengl", fov=50.0, size=(30, 20)) == camera
+    assert not Camera.from_matrix(np.eye(4), height=2.0).is_perspective
+
+
+def test_camera_from_intrinsics():
+    """A point projects where K (R x + t) says, principal point anywhere; K comes back."""
+    intrinsics = np.array([[50.0, 0.0, 11.5], [0.0, 50.0, 21.25], [0.0, 0.0, 1.0]])
+    shift = np.array([0.1, -0.2, 3.0])
+    camera = Camera.from_intrinsics(intrinsics, turned(), shift, (40, 30), near=0.5)
+    point = np.array([0.3, 0.2, -0.4])
+    x, y, z = intrinsics @ (turned() @ point + shift)
+    assert project(camera, point) == pytest.approx((x / z, y / z))
+    np.testing.assert_allclose(camera.intrinsics(), intrinsics, rtol=1e-12)
+    assert (camera.near, camera.size) == (0.5, (40, 30))
+    half = camera.resized((20, 15))
+    assert project(half, point) == pytest.approx((0.5 * x / z, 0.5 * y / z))
+
+
+@pytest.mark.parametrize("options", [{"fov": 60.0}, {"height": 2.0}])
+def test_principal_point_shifts_the_image(options):
+    """Three pixels to the right and two up: the same pixels elsewhere."""
+    scene = Scene(Camera((0, 0, 3), (0, 0, 0), size=(24, 20), **options), [SceneObject("x", *TRIANGLE)])
+    image = render(scene)
+    shifted = render(scene, replace(scene.camera, principal=(15.0, 8.0)))
+    np.testing.assert_allclose(shifted[:18, 3:], image[2:, :21], atol=1e-6)
+    assert image[2:, :21].max() > 0.5
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"intrinsics": np.diag([50.0, 60.0, 1.0])}, "got focal lengths 50 and 60 and skew 0, expected square pixels"),
+        ({"intrinsics": np.eye(4)}, r"intrinsics: got shape \(4, 4\)"),
+        ({"rotation": 2.0 * np.eye(3)}, "rotation: got a matrix that is no rotation"),
+        ({"rotation": -np.eye(3)}, "rotation: got a matrix that is no rotation"),
+        ({"translation": [1.0, 2.0]}, r"translation: got shape \(2,\)"),
+    ],
+)
+def test_refused_calibrations(change, words):
+    """What is no calibration of square pixels is refused with its name."""
+    given = {"intrinsics": np.diag([50.0, 50.0, 1.0]), "rotation": np.eye(3), "translation": np.zeros(3)}
+    with pytest.raises(ValueError, match=words):
+        Camera.from_intrinsics(**{**given, **change}, size=(40, 30))
+    with pytest.raises(ValueError, match="axes: got"):
+        Camera.from_matrix(np.eye(4), axes="blender", fov=50.0)
+
+
+def test_look_at_is_the_constructor():
+    """With eye, target and up."""
+    assert Camera.look_at([0, 0, 3], [0, 0, 0], fov=45.0) == Camera((0, 0, 3), (0, 0, 0), fov=45.0)

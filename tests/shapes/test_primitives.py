@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from warpfrag.scene.light import lambert, transformed_normals
 from warpfrag.shapes import primitives
-from warpfrag.shapes.mesh import Mesh, lambert, smooth_normals, split_faces, transformed_normals, weld
+from warpfrag.shapes.mesh import Mesh, smooth_normals, split_faces, weld
 
 SHAPES = {
     "sphere": (lambda **k: primitives.sphere(1.5, 128, **k), 4 / 3 * np.pi * 1.5**3),

@@ -5,6 +5,7 @@ import pytest
 
 import warpfrag as wf
 from warpfrag.files.points import load_points
+from warpfrag.scene.assemble import assemble
 from warpfrag.shapes.surfels import PointSet, estimate_normals, spacing, surfels
 
 HALF = 0.21586050011389926  # 128/255 in sRGB, in linear light
@@ -153,8 +154,9 @@ def test_light_falls_on_points(tmp_path):
     """The normals of points are lit: estimated ones of a plane, from either side."""
     write(tmp_path, "grid.xyz", GRID)
     light = "[light]\ndirection = [0, 0.6, 0.8]\nambient = 0.2\n"
-    (item,) = scene_of(tmp_path, 'points = "grid.xyz"\n', light).objects
-    np.testing.assert_allclose(item.shade, 0.2 + 0.8 * 0.8, rtol=1e-5)
+    scene = scene_of(tmp_path, 'points = "grid.xyz"\n', light)
+    (item,) = scene.objects
+    np.testing.assert_allclose(assemble(scene).rgba[:, 0] / item.color[0], 0.2 + 0.8 * 0.8, rtol=1e-5)
 
 
 def test_gradients_reach_the_colours_of_discs(tmp_path):

@@ -61,6 +61,14 @@ class Kind:
         """Return an array without its gradient."""
         return array
 
+    def clip(self, array: Any, low: float, high: float) -> Any:
+        """Return an array with numbers outside of a range put on its ends.
+
+        There the gradient is that of the end, but zero if following it (downhill) would lead farther outside: what has
+        strayed out comes back in.
+        """
+        return self.xp.clip(array, low, high)
+
     def records(self, arrays: Iterable[Any]) -> bool:
         """Tell whether gradients are recorded in any of the arrays (those that are not None)."""
         return False

@@ -18,6 +18,30 @@ _LIBRARY = "warpfrag"
 _SCHEMA_TYPES = {int: "int", float: "float", str: "str", bool: "bool"}
 
 
+class _Clip(torch.autograd.Function):
+    """Clamping whose gradient outside of the range leads back into it; see `Kind.clip`."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(array: torch.Tensor, low: float, high: float) -> torch.Tensor:
+        """Return the clamped array."""
+        return array.clamp(low, high)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+        """Keep where the array was."""
+        array, ctx.low, ctx.high = inputs
+        ctx.save_for_backward(array)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Any) -> Any:
+        """Return the gradient in the array; zero where it is outside and downhill leads farther."""
+        (array,), grad = ctx.saved_tensors, grads[0]
+        farther = ((array > ctx.high) & (grad < 0.0)) | ((array < ctx.low) & (grad > 0.0))
+        return grad.masked_fill(farther, 0.0), None, None
+
+
 class TorchKind(Kind):
     """torch tensors, with autograd."""
 
@@ -45,6 +69,9 @@ class TorchKind(Kind):
 
     def detach(self, array: Any) -> Any:
         return array.detach()
+
+    def clip(self, array: Any, low: float, high: float) -> Any:
+        return _Clip.apply(array, low, high)
 
     def records(self, arrays: Iterable[Any]) -> bool:
         return torch.is_grad_enabled() and any(array is not None and array.requires_grad for array in arrays)

@@ -246,7 +246,13 @@ def capture_kbuffer(
     surfaces = surfaces_of(scene, camera, parameters)
     with surfaces.in_order():
         return kbuffer_of_surfaces(
-            surfaces, Window.of(camera), memory_limit, slots=int(slots), merge=merge, tail=tail, map_words=map_words
+            surfaces,
+            Window.of(surfaces.camera),
+            memory_limit,
+            slots=int(slots),
+            merge=merge,
+            tail=tail,
+            map_words=map_words,
         )
 
 
@@ -318,7 +324,7 @@ def count_culled(
     camera = check_scene(scene, camera)
     map_words = _check_options(slots, merge, tail, cull, words)
     surfaces = surfaces_of(scene, camera, parameters)
-    window = Window.of(camera)
+    window = Window.of(surfaces.camera)
     options = BoundedWindow(**asdict(window), slots=int(slots), merge=merge, tail=tail, map_words=map_words)
     kind, arrays = surfaces.kind, operator_arrays(surfaces)
     for name in ("points", "rgba", "thickness", "maps"):

@@ -39,7 +39,9 @@ from warpfrag.fragments import Fragments
 from warpfrag.raster.ray import Window, centre_x, centre_y
 from warpfrag.raster.triangles import RasterTriangles
 from warpfrag.scene.camera import Camera
+from warpfrag.scene.parameters import Bounds
 from warpfrag.scene.scene import Scene
+from warpfrag.scene.visibility import warn_if_empty
 from warpfrag.storage.lists import DYNAMIC, sort_lists
 from warpfrag.storage.method import Room, Storage, count_fragments, fill
 
@@ -101,7 +103,8 @@ class Coverage:
         camera = check_scene(scene, camera)
         surfaces = surfaces_of(scene, camera, parameters)
         with surfaces.in_order():
-            return find_coverage(scene, camera, surfaces, Window.of(camera), sort=sort, memory_limit=memory_limit)
+            window = Window.of(surfaces.camera)
+            return find_coverage(scene, surfaces.camera, surfaces, window, sort=sort, memory_limit=memory_limit)
 
     @property
     def count(self) -> int:
@@ -125,6 +128,8 @@ class Coverage:
             ValueError: an argument is out of its range.
         """
         surfaces = surfaces_of(self.scene, self.camera, parameters, self.tables)
+        if surfaces.camera != self.camera:
+            raise ValueError("parameters: got another lens than coverage was found with, expected the same")
         with surfaces.in_order():
             return self.to(surfaces.device).shade_surfaces(surfaces)
 
@@ -141,7 +146,8 @@ class Coverage:
     def is_of(self, surfaces: CameraSurfaces) -> bool:
         """Tell whether surfaces of this scene and camera have the vertices that coverage was found with, to the bit."""
         points = surfaces.kind.to_warp(surfaces.points)
-        return points.dtype == self.points.dtype and np.array_equal(points.numpy(), self.points.numpy())
+        alike = surfaces.camera == self.camera and points.dtype == self.points.dtype
+        return alike and np.array_equal(points.numpy(), self.points.numpy())
 
     def to(self, device: wp.Device) -> "Coverage":
         """Return the same coverage on a device, itself if it is there."""
@@ -252,6 +258,7 @@ def capture(
     *,
     parameters: Mapping[str, Any] | None = None,
     rows: tuple[int, int] | None = None,
+    bounds: Bounds = "clamp",
     memory_limit: float | None = None,
 ) -> Fragments:
     """Capture every surface that a pixel's ray meets as a fragment (the dynamic fragment buffer).
@@ -259,7 +266,7 @@ def capture(
     A triangle covers a pixel if the pixel's centre lies in its projection: by the top-left rule on edges, from both
     sides, between the near and far planes. Differentiable in vertices, translations and rotations of objects and
     camera, colour, opacity and thickness; which pixels a triangle covers, the order of the fragments, the texels that a
-    lookup takes and the baked Lambert factors are held fixed: a gradient in vertices or poses moves depths and
+    lookup takes and the factors of light are held fixed: a gradient in vertices or poses moves depths and
     attributes inside outlines, not the outlines.
 
     Args:
@@ -270,6 +277,8 @@ def capture(
             torch tensors, in which the fragments are then differentiable. `"thickness"` is that of all objects without
             a value of their own here. `"beta"` is not used here.
         rows: capture only these rows [begin, end) of the image; default all.
+        bounds: what becomes of parameters out of their range: "clamp" puts them on its end, with a gradient that leads
+            back in but not farther out; "error" refuses them.
         memory_limit: most memory that fragments and their gradients may take [bytes]; default half of what is free.
 
     Returns:
@@ -286,10 +295,13 @@ def capture(
         (512, 512)
     """
     camera = check_scene(scene, camera)
-    window = Window.of(camera, _check_rows(rows, camera))
-    surfaces = surfaces_of(scene, camera, parameters)
+    checked_rows = _check_rows(rows, camera)
+    surfaces = surfaces_of(scene, camera, parameters, bounds=bounds)
+    window = Window.of(surfaces.camera, checked_rows)
     with surfaces.in_order():
-        coverage = find_coverage(scene, camera, surfaces, window, sort=sort, memory_limit=memory_limit)
+        coverage = find_coverage(scene, surfaces.camera, surfaces, window, sort=sort, memory_limit=memory_limit)
+        if rows is None:
+            warn_if_empty(coverage.count, scene, camera)
         return coverage.shade_surfaces(surfaces, moved=False)
 
 

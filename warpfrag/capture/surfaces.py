@@ -17,6 +17,8 @@ from warpfrag.raster.ray import Rays, Window
 from warpfrag.raster.triangles import RasterTriangles, prepare_triangles
 from warpfrag.scene.assemble import Geometry, assemble
 from warpfrag.scene.camera import Camera
+from warpfrag.scene.lens import Lens
+from warpfrag.scene.parameters import Bounds
 from warpfrag.scene.pose import move_camera
 from warpfrag.scene.scene import Scene
 
@@ -142,6 +144,7 @@ class CameraSurfaces:
         maps: thickness maps, (maps, H·W), or None.
         objects: table of objects, (objects, 3) int32, Warp array.
         tables: what no parameter changes.
+        camera: the one that sees them, with the lens that parameters give it.
     """
 
     points: Any
@@ -150,6 +153,7 @@ class CameraSurfaces:
     maps: Any
     objects: wp.array
     tables: SurfaceTables
+    camera: Camera
 
     @property
     def kind(self) -> Kind:
@@ -192,15 +196,20 @@ def check_scene(scene: Any, camera: Any) -> Camera:
 
 
 def surfaces_of(
-    scene: Scene, camera: Camera, parameters: Mapping[str, Any] | None = None, tables: SurfaceTables | None = None
+    scene: Scene,
+    camera: Camera,
+    parameters: Mapping[str, Any] | None = None,
+    tables: SurfaceTables | None = None,
+    *,
+    bounds: Bounds = "clamp",
 ) -> CameraSurfaces:
     """Return a scene's surfaces for parameter values; `tables` are those of the scene, if there are any yet."""
-    return place_surfaces(assemble(scene, parameters, camera=camera), camera, tables)
+    return place_surfaces(assemble(scene, parameters, camera=camera, bounds=bounds), tables)
 
 
-def place_surfaces(geometry: Geometry, camera: Camera, tables: SurfaceTables | None = None) -> CameraSurfaces:
+def place_surfaces(geometry: Geometry, tables: SurfaceTables | None = None) -> CameraSurfaces:
     """Take a scene's geometry from world to camera space, and its tables to the device of its arrays."""
-    kind = kind_of(geometry.rgba)
+    kind, camera = kind_of(geometry.rgba), geometry.camera
     assert kind is not None
     place = kind.device_of(geometry.rgba)
     device = wp.get_device("cpu" if place is None else str(place))
@@ -218,17 +227,22 @@ def place_surfaces(geometry: Geometry, camera: Camera, tables: SurfaceTables | N
     if distinct:
         maps = kind.xp.stack(distinct).reshape((len(distinct), camera.shape[0] * camera.shape[1]))
     return CameraSurfaces(
-        to_camera_space(geometry.vertices, camera, geometry.camera_pose, dtype_name(geometry.rgba)),
+        to_camera_space(geometry.vertices, camera, geometry.camera_pose, geometry.precision, geometry.lens),
         geometry.rgba,
         geometry.thickness,
         maps,
         tables.objects(map_rows),
         tables,
+        camera,
     )
 
 
 def to_camera_space(
-    vertices: Any, camera: Camera, pose: tuple[Any, Any] | None = None, precision: str = "float32"
+    vertices: Any,
+    camera: Camera,
+    pose: tuple[Any, Any] | None = None,
+    precision: str = "float32",
+    lens: Lens | None = None,
 ) -> Any:
     """Return world vertices in camera space, computed in float64 and rounded once; differentiable in torch.
 
@@ -239,6 +253,7 @@ def to_camera_space(
         camera: where from.
         pose: translation and rotation of the camera in its own axes, see `warpfrag.scene.pose`; None where it stays.
         precision: that of the result, "float32" or "float64".
+        lens: how points move with the parameters of the camera's lens; None for not at all.
     """
     kind = kind_of(vertices)
     assert kind is not None
@@ -247,5 +262,8 @@ def to_camera_space(
     # Python's own floats: torch would turn NumPy's into arrays.
     rows = [[float(value) for value in row] for row in camera.view_matrix()[:3]]
     coordinates = [row[0] * x + row[1] * y + row[2] * z + row[3] for row in rows]
-    points = kind.xp.stack(coordinates if pose is None else move_camera(coordinates, *pose), 1)
-    return kind.astype(points, precision)
+    if pose is not None:
+        coordinates = move_camera(coordinates, *pose)
+    if lens is not None:
+        coordinates = lens.apply(coordinates)
+    return kind.astype(kind.xp.stack(coordinates, 1), precision)

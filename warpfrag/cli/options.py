@@ -1,7 +1,7 @@
 """Options that several commands have, and how their words are read: numbers, sizes, colours, NAME=VALUE."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -66,7 +66,7 @@ def read_scene(
     if parameters is not None:
         from warpfrag.files.result_file import read_found
 
-        scene = with_values(scene, read_found(parameters, scene.parameter_names()))
+        scene = scene.with_parameters(read_found(parameters, scene.parameter_names()))
     scene = _with_settings(scene, settings or [])
     changes: dict[str, Any] = {
         "beta": None if beta is None else parse_number("--beta", beta, 0.0, 1.0),
@@ -134,39 +134,12 @@ def parse_thickness(option: str, text: str) -> dict[str, Any]:
     return {"thickness": number, "thickness_unit": "scene"}
 
 
-def with_values(scene: "Scene", values: Mapping[str, Any]) -> "Scene":
-    """Return a scene with parameters built in; poses last, as a turn is about the middle of what is there."""
-    from warpfrag.scene.names import POSE_KEYS
-    from warpfrag.scene.pose import posed
-
-    objects = []
-    for item in scene.objects:
-        own = {key: values[name] for key in _OBJECT_KEYS if (name := f"{item.name}.{key}") in values}
-        if "thickness" in values:
-            own.setdefault("thickness", values["thickness"])
-        # A value of its own may come with its unit.
-        fields: dict[str, Any] = {}
-        for key, value in own.items():
-            fields.update(value if isinstance(value, dict) else {key: value})
-        objects.append(replace(item, **fields) if fields else item)
-    scene = replace(scene, objects=objects, beta=float(values.get("beta", scene.beta)))
-    poses = {name: value for name, value in values.items() if name.rpartition(".")[2] in POSE_KEYS}
-    return posed(scene, poses) if poses else scene
-
-
-_OBJECT_KEYS = ("thickness", "color", "opacity", "vertices")
-
-
 def _with_settings(scene: "Scene", settings: Sequence[str]) -> "Scene":
-    """Apply `NAME=VALUE`s in order, rotations last: the camera's translation is along its axes in the file."""
-    values: dict[str, Any] = {}
-    for setting in settings:
-        name, text = _split(setting, scene)
-        values[name] = _parse_value(name, text)
-    order = sorted(values, key=lambda name: name.endswith(".rotation"))
-    for name in order:
-        scene = with_values(scene, {name: values[name]})
-    return scene
+    """Apply `NAME=VALUE`s: of one name the last, all at once, so that their order does not matter."""
+    try:
+        return scene.with_parameters(dict(_split(setting, scene) for setting in settings))
+    except (ValueError, TypeError) as error:
+        raise error if isinstance(error, UsageError) else UsageError(f"--set {error}") from None
 
 
 def _split(setting: str, scene: "Scene") -> tuple[str, str]:
@@ -179,31 +152,23 @@ def _split(setting: str, scene: "Scene") -> tuple[str, str]:
         if setting.strip().startswith(name) and rest.startswith("="):
             return name, rest[1:].strip()
     name = setting.partition("=")[0].strip()
+    if name in scene.parameter_names():
+        raise UsageError(f"--set: got {shorten(name)}, expected a parameter that one line holds")
     raise UsageError(f"--set: got the unknown name {shorten(name)}; {suggest(name, known)}")
 
 
-def _parse_value(name: str, text: str) -> Any:
-    from warpfrag.colors import parse_hex
-    from warpfrag.scene.names import POSE_KEYS
-
-    option, key = f"--set {name}", name.rpartition(".")[2]
-    if key in POSE_KEYS:
-        return _numbers(option, text, (3,), "x,y,z")
-    if key == "thickness":
-        return parse_thickness(option, text)
-    if key == "color":
-        return tuple((parse_hex(text) or _numbers(option, text, (3,), '"#rrggbb" or "r,g,b"'))[:3])
-    return _numbers(option, text, (1,), range_wording(0.0, 1.0))[0]
-
-
 def _numbers(option: str, text: str, counts: Sequence[int], expected: str) -> list[float]:
+    from warpfrag.files.table import LARGEST
+
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:
         numbers = []
-    if len(numbers) not in counts:
-        raise UsageError(f"{option}: got {_shown(text)}, expected {expected}")
-    return numbers
+    if len(numbers) in counts and any(abs(number) > LARGEST for number in numbers):
+        expected = f"{expected}, of at most {LARGEST:.3g}"
+    elif len(numbers) in counts:
+        return numbers
+    raise UsageError(f"{option}: got {_shown(text)}, expected {expected}")
 
 
 def _shown(text: str) -> str:

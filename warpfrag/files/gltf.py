@@ -6,6 +6,7 @@ Draco. Not read, as nothing here would draw it: normal, metal, roughness and occ
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ import numpy as np
 from warpfrag.files.gltf_document import Document
 from warpfrag.files.gltf_primitives import Primitives, Skin
 from warpfrag.files.source import Source
-from warpfrag.shapes.mesh import Mesh, join, named, placed
+from warpfrag.shapes.mesh import Mesh, join, placed
 
 # Of all instances together; more do not fit into memory.
 MOST_FACES = 2**26
@@ -50,7 +51,8 @@ def read_gltf(source: Source) -> tuple[list[Mesh], str]:
         pieces = [placed(mesh, world @ instance) for instance in instances for mesh in meshes]
         if pieces:
             mesh_name = document.entry("meshes", node["mesh"]).get("name")
-            parts.append(named(join(pieces), str(node.get("name") or mesh_name or f"node {index}")))
+            name = str(node.get("name") or mesh_name or f"node {index}")
+            parts.append(replace(join(pieces), name=name))
     if primitives.left_out and parts:
         source.note(f"{' and '.join(sorted(primitives.left_out))} are not drawn")
     return parts, f" (it holds {', '.join(sorted(primitives.left_out))})" if primitives.left_out else ""
@@ -126,12 +128,13 @@ def _instances(document: Document, node: dict[str, Any]) -> np.ndarray:
     )
 
 
-def _skin(document: Document, index: int, matrices: dict[int, np.ndarray]) -> Skin:
+def _skin(document: Document, index: int, matrices: dict[int, np.ndarray]) -> Skin | None:
     skin = document.entry("skins", index)
     joints = skin.get("joints", [])
     unknown = [joint for joint in joints if joint not in matrices]
-    if unknown:
-        raise ValueError(f"got joint {unknown[0]} of a skin, which is not in the scene")
+    if unknown or not joints:
+        document.source.note("a skin whose joints are not in the scene, drawn without")
+        return None
     world = np.stack([matrices[joint] for joint in joints])
     if "inverseBindMatrices" in skin:
         inverse = document.accessor(skin["inverseBindMatrices"])[: len(joints)].reshape(-1, 4, 4).transpose(0, 2, 1)

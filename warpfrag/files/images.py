@@ -5,6 +5,7 @@ linear opacity, so what emits without opacity is lost there; OpenEXR and `.npy` 
 """
 
 import os
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from warpfrag.colors import encode
 from warpfrag.files.exr import openexr, read_exr, write_exr
 from warpfrag.files.pixels import check_pixels, decode_image, with_opacity
 from warpfrag.files.saving import replacing
-from warpfrag.files.source import check_regular, read_regular, wording_of_path, wording_unless_regular
+from warpfrag.files.source import ReadingWarning, check_regular, read_regular, wording_of_path, wording_unless_regular
 
 SUFFIXES = (".png", ".exr", ".npy")
 # Of images that are only read.
@@ -133,7 +134,9 @@ def check_target(path: str | os.PathLike, *, bits: int = 8) -> None:
 
 def _read(path: Path, reader: Callable[[Path], np.ndarray]) -> np.ndarray:
     try:
-        return reader(path)
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always", ReadingWarning)
+            image = reader(path)
     except ImportError:
         raise
     # Decoders raise whatever they like on broken files (SyntaxError, struct.error, zlib.error, …).
@@ -143,6 +146,10 @@ def _read(path: Path, reader: Callable[[Path], np.ndarray]) -> np.ndarray:
         if reason.startswith("got "):
             raise ImageError(f"{name}: {reason}") from error
         raise ImageError(f"{name}: got an image that cannot be read ({reason[:160]})") from error
+    for warning in told:
+        if issubclass(warning.category, ReadingWarning):
+            warnings.warn(f"{wording_of_path(path)}: {warning.message}", ReadingWarning, stacklevel=3)
+    return image
 
 
 def _suffix(path: Path, known: tuple[str, ...]) -> str:

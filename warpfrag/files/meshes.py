@@ -91,7 +91,8 @@ def _read(path: str | os.PathLike, root: str | os.PathLike | None, *, split: boo
         reason = words if isinstance(error, (ValueError, OSError)) else f"{type(error).__name__}: {words}"
         left_out = f": {source.wording()}" if source.wording() else ""
         kind = "USD" if suffix in USD_SUFFIXES else suffix[1:]
-        raise ValueError(f"got a {kind} file that cannot be read: {name} ({reason}){left_out}") from error
+        article = "an" if kind in ("obj", "stl", "off") else "a"
+        raise ValueError(f"got {article} {kind} file that cannot be read: {name} ({reason}){left_out}") from error
     if not parts:
         raise ValueError(f"got no faces in {name}{holds}, expected a mesh with triangles")
     source.warn()
@@ -116,7 +117,11 @@ def warp_asset(name: str) -> Path:
 
 def _check(parts: list[Mesh]) -> None:
     for part in parts:
-        if not np.isfinite(part.vertices).all():
+        if not len(part.vertices):
+            continue
+        # NaN and infinity are found in the least and the largest of all as well.
+        farthest = max(-float(part.vertices.min()), float(part.vertices.max()))
+        if not np.isfinite(farthest):
             raise ValueError("a vertex is not finite")
-        if len(part.vertices) and np.abs(part.vertices).max() > LARGEST:
-            raise ValueError(f"a vertex is at {np.abs(part.vertices).max():.3g}, expected at most {LARGEST:.3g}")
+        if farthest > LARGEST:
+            raise ValueError(f"a vertex is at {farthest:.3g}, expected at most {LARGEST:.3g}")

@@ -1,6 +1,5 @@
 """The MTL format: the materials of OBJ files, as colours, opacities and images."""
 
-import re
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -116,6 +115,9 @@ def _parse(text: str, source: Source) -> dict[str, Material]:
             if value is not None:
                 current.given.add(word)
                 current.opacity = min(max(value if word == "d" else 1.0 - value, 0.0), 1.0)
+                if word == "tr" and current.opacity == 0.0:
+                    # Some programs write 1 for what they mean to be opaque.
+                    source.note(f'a material of "Tr {rest}" is invisible')
         elif word == "map_kd":
             current.color_map = _image_map(rest, source)
         elif word in ("map_d", "map_opacity"):
@@ -156,8 +158,9 @@ def _image_map(words: str, source: Source) -> ImageMap | None:
             values[option].append(rest.pop(0))
     if not rest:
         return None
-    # As it stands in the line: blanks within a name count.
-    name = re.split(r"\s+", words, maxsplit=len(words.split()) - len(rest))[-1].strip().strip('"')
+    # The name as it stands in the line: blanks in it count.
+    taken = len(words.split()) - len(rest)
+    name = (words.split(None, taken)[-1] if taken else words).strip().strip('"')
     for option in ("-t", "-mm"):
         neutral = {"-t": [0.0, 0.0, 0.0], "-mm": [0.0, 1.0]}[option]
         if [_number(word) for word in values.get(option, [])] not in ([], neutral[: len(values.get(option, []))]):

@@ -133,7 +133,10 @@ def _mesh(lines: _Lines, materials: dict[str, Material], source: Source) -> tupl
         (("vertex", lines.positions), ("coordinate", lines.coordinates), ("normal", lines.normals))
     ):
         low, high = int(triples[:, column].min()), int(triples[:, column].max())
-        if low < (1 if column == 0 else 0) or high > len(given):
+        if column and (low < 0 or high > len(given)):
+            source.note(f"some faces name {what}s that are not there, drawn without")
+            triples[(triples[:, column] < 0) | (triples[:, column] > len(given)), column] = 0
+        elif column == 0 and (low < 1 or high > len(given)):
             raise ValueError(f"a face names {what} {high if high > len(given) else low}, there are {len(given)}")
     counts = np.array(lines.counts, dtype=np.int64)
     polygon, places = cut_polygons(positions, counts, triples[corner, 0] - 1)

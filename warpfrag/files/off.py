@@ -1,5 +1,6 @@
 """OFF files (OFF, COFF, NOFF): polygons in text, with colours of vertices or faces."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,8 @@ from warpfrag.files.polygons import cut_polygons
 from warpfrag.files.source import Source
 from warpfrag.shapes.mesh import Mesh, unshared
 
-_MOST_HEADER_WORDS = 8
+# Texture coordinates (ST) and a fourth dimension are not read.
+_HEADER = re.compile(r"\s*(C?N?OFF)", re.IGNORECASE)
 
 
 def read_off(source: Source) -> tuple[list[Mesh], str]:
@@ -18,11 +20,12 @@ def read_off(source: Source) -> tuple[list[Mesh], str]:
     Raises:
         ValueError: the file cannot be read.
     """
-    lines = [line for line in (raw.partition("#")[0].split() for raw in _lines(source)) if line]
-    header = lines[0][0].upper() if lines else ""
-    if not header.endswith("OFF") or len(header) > _MOST_HEADER_WORDS or "4" in header:
+    text = source.read().decode("utf-8", "replace")
+    match = _HEADER.match(text)
+    if match is None:
         raise ValueError("got no OFF header")
-    rest = [lines[0][1:], *lines[1:]] if len(lines[0]) > 1 else lines[1:]
+    header = match[1].upper()
+    rest = [line for line in (raw.partition("#")[0].split() for raw in text[match.end() :].splitlines()) if line]
     if not rest or len(rest[0]) < 2:
         raise ValueError("got no numbers of vertices and faces")
     vertex_count, face_count = int(rest[0][0]), int(rest[0][1])
@@ -49,10 +52,6 @@ def read_off(source: Source) -> tuple[list[Mesh], str]:
         return [mesh if rgba is None else _with(mesh, rgba)], ""
     rgba = _rgba([row[1 + n :] for row, n in zip(faces, counts, strict=True)])
     return [mesh if rgba is None else _with(unshared(mesh), np.repeat(rgba[polygon], 3, axis=0))], ""
-
-
-def _lines(source: Source) -> list[str]:
-    return source.read().decode("utf-8", "replace").splitlines()
 
 
 def _rgba(words: list[list[str]]) -> np.ndarray | None:

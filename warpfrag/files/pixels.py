@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from warpfrag.colors import decode, srgb_to_linear
+from warpfrag.files.source import ReadingWarning
 
 # Of one image: 1 GiB as float32 RGBA.
 MOST_PIXELS = 2**26
@@ -121,7 +122,9 @@ def _without_profile(image: Any) -> Any:
         color = image.convert({"RGBA": "RGB", "LA": "L"}.get(image.mode, image.mode))
         converted = ImageCms.profileToProfile(color, profile, ImageCms.createProfile("sRGB"), outputMode="RGB")
     except (ImageCms.PyCMSError, OSError) as error:
-        raise ValueError(f"got a colour profile that cannot be used ({' '.join(str(error).split())})") from error
+        reason = " ".join(str(error).split())
+        warnings.warn(f"a colour profile that cannot be used ({reason}), taken as sRGB", ReadingWarning, stacklevel=6)
+        return image
     assert converted is not None
     if opacity is not None:
         converted.putalpha(opacity)
@@ -139,7 +142,7 @@ def _decode_png(data: bytes, managed: bool) -> np.ndarray:
     small_grey = header.bits < 8 and header.color_type == _GREY
     stored, bits = _png_as_stored(data) if header.bits == 16 or small_grey else (_png8(data), 8)
     if header.has_profile and managed:
-        raise ValueError("got 16-bit colours with a colour profile, expected sRGB, linear light or a gamma")
+        warnings.warn("a colour profile of 16-bit colours is not applied, taken as sRGB", ReadingWarning, stacklevel=5)
     if header.gamma is None or not managed:
         return decode(stored, bits)
     top = 2**bits - 1

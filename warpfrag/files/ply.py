@@ -69,9 +69,9 @@ def read_ply(data: bytes) -> PlyFile:
         for element in elements:
             start = _read_binary(element, data, start, order)
     else:
-        numbers, place = _numbers(data[start:]), 0
+        lines, place = [line for line in data[start:].splitlines() if line.strip()], 0
         for element in elements:
-            place = _read_text(element, numbers, place)
+            place = _read_text(element, lines, place)
     return PlyFile({element.name: element for element in elements}, comments)
 
 
@@ -206,54 +206,57 @@ def _gather(data: bytes, places: np.ndarray, counts: np.ndarray, kind: str) -> n
     return values
 
 
-def _numbers(body: bytes) -> np.ndarray:
+def _numbers(lines: list[bytes]) -> np.ndarray:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         try:
-            return np.fromstring(body.decode("ascii"), dtype=np.float64, sep=" ")
+            return np.fromstring(b"\n".join(lines).decode("ascii"), dtype=np.float64, sep=" ")
         except (DeprecationWarning, ValueError) as error:
             raise ValueError("got words among the numbers of a PLY file in text") from error
 
 
-def _read_text(element: Element, numbers: np.ndarray, place: int) -> int:
-    """Take an element's entries from the numbers of a text file; return where the next one's begin."""
-    width = len(element.kinds)
-    if element.count * width > len(numbers) - place:
+def _read_text(element: Element, lines: list[bytes], start: int) -> int:
+    """Take an element's entries, each on a line, from a text file; return the line where the next one's begin."""
+    if element.count > len(lines) - start:
         raise ValueError(f'got a file that ends within its {element.count} entries of "{element.name}"')
-    if element.count == 0 or width == 0:
+    if element.count == 0 or not element.kinds:
         _leave_empty(element)
-        return place
-    if all(count is None for _, count in element.kinds.values()):
-        rows = numbers[place : place + element.count * width].reshape(element.count, width)
+        return start + element.count
+    own = lines[start : start + element.count]
+    numbers = _numbers(own)
+    is_list = [count is not None for _, count in element.kinds.values()]
+    if not any(is_list) and len(numbers) == element.count * len(is_list):
+        rows = numbers.reshape(element.count, -1)
         for column, (name, (kind, _)) in enumerate(element.kinds.items()):
             element.scalars[name] = rows[:, column].astype(kind)
-        return place + element.count * width
-    lists = [count is not None for _, count in element.kinds.values()]
-    places = [np.empty(element.count, dtype=np.int64) for _ in lists]
-    counts = [np.ones(element.count, dtype=np.int64) for _ in lists]
-    end = len(numbers)
+        return start + element.count
+    widths = np.array([len(line.split()) for line in own])
+    places = [np.empty(element.count, dtype=np.int64) for _ in is_list]
+    counts = [np.ones(element.count, dtype=np.int64) for _ in is_list]
     # As a list of Python's numbers: taking them from an array one by one is several times slower.
-    rest = numbers[place:].tolist()
-    at = 0
-    for entry in range(element.count):
-        for which, is_list in enumerate(lists):
+    plain = numbers.tolist()
+    end = 0
+    for entry, width in enumerate(widths.tolist()):
+        at, end = end, end + width
+        for which, listed in enumerate(is_list):
             length = 1
-            if is_list:
-                length = int(rest[at]) if place + at < end else -1
+            if listed:
+                length = int(plain[at]) if at < end else -1
                 counts[which][entry] = length
                 at += 1
-            places[which][entry] = place + at
+            places[which][entry] = at
             at += length
-            if length < 0 or place + at > end:
-                raise ValueError(f'got a file that ends within entry {entry} of "{element.name}"')
+            # What a line has beyond its entry is not looked at.
+            if length < 0 or at > end:
+                raise ValueError(f'got a line that ends within entry {entry} of "{element.name}"')
     for which, (name, (kind, count)) in enumerate(element.kinds.items()):
-        starts = np.repeat(places[which] - (np.cumsum(counts[which]) - counts[which]), counts[which])
-        values = numbers[starts + np.arange(len(starts))].astype(kind)
+        first = np.repeat(places[which] - (np.cumsum(counts[which]) - counts[which]), counts[which])
+        values = numbers[first + np.arange(len(first))].astype(kind)
         if count is None:
             element.scalars[name] = values
         else:
             element.lists[name] = Lists(counts[which], values)
-    return place + at
+    return start + element.count
 
 
 def _leave_empty(element: Element) -> None:

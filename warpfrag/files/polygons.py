@@ -6,8 +6,6 @@ polygons would cover what lies outside.
 
 import numpy as np
 
-from warpfrag.extras import need
-
 
 def cut_polygons(points: np.ndarray, counts: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Divide polygons into triangles.
@@ -23,13 +21,16 @@ def cut_polygons(points: np.ndarray, counts: np.ndarray, corners: np.ndarray) ->
     Raises:
         ValueError: a corner names a point that is not there.
     """
-    counts, corners = np.asarray(counts, dtype=np.int64), np.asarray(corners, dtype=np.int64)
+    counts = np.asarray(counts, dtype=np.int64)
     if len(corners) and not (corners.min() >= 0 and corners.max() < len(points)):
         wrong = corners.min() if corners.min() < 0 else corners.max()
         raise ValueError(f"a face names vertex {wrong}, there are {len(points)}")
+    if (counts == 3).all():
+        return np.arange(len(counts)), np.arange(3 * len(counts)).reshape(-1, 3)
+    corners = np.asarray(corners, dtype=np.int64)
     first = np.cumsum(counts) - counts
     polygon, places = _fans(counts, first)
-    if not len(counts) or counts.max() <= 3:
+    if counts.max() <= 3:
         return polygon, places
     reflex = _reflex_corners(points, counts, first, corners)
     concave = np.unique(np.repeat(np.arange(len(counts)), counts)[reflex])
@@ -88,14 +89,15 @@ def _reflex_corners(points: np.ndarray, counts: np.ndarray, first: np.ndarray, c
 
 def _ears(polygon: np.ndarray) -> np.ndarray:
     """Return the triangles of one polygon (n, 3) as its corners' numbers, in its own sense of turning."""
-    library = need("mapbox_earcut", "", "Cutting concave polygons")
+    import mapbox_earcut
+
     count = np.array([len(polygon)])
     normal = _normals(polygon, count, np.array([0]), np.arange(len(polygon)))[0]
     # Seen along the axis that the normal is closest to.
     axis = int(np.abs(normal).argmax())
     across = (axis + 1) % 3, (axis + 2) % 3
     flat = np.ascontiguousarray((polygon - polygon.mean(axis=0))[:, across])
-    triangles = library.triangulate_float64(flat, count.astype(np.uint32)).reshape(-1, 3).astype(np.int64)
+    triangles = mapbox_earcut.triangulate_float64(flat, count.astype(np.uint32)).reshape(-1, 3).astype(np.int64)
     a, b, c = flat[triangles].transpose(1, 0, 2)
     area = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
     wrong = area * normal[axis] < 0.0

@@ -5,9 +5,9 @@ Lengths are in scene units, angles in degrees, colours straight linear RGB in 0�
 Top level: `beta layers merge mix background` and the tables `[camera]`, `[light]`, `[[object]]`.
 
 - `[camera]`: `eye target up fov | height near far size`, as in `Camera`.
-- `[light]`: `direction` (towards the light, or `"camera"`: from the eye, the default) and `ambient` (0.3). The colour
-  of each vertex is multiplied by ambient + (1 − ambient)·|n·l|, once, when the file is read. Without the table all is
-  unlit.
+- `[light]`: `direction` (towards the light, or `"camera"`: from the eye of the camera that renders, the default) and
+  `ambient` (0.3). The colour of each vertex is multiplied by ambient + (1 − ambient)·|n·l|, wherever objects and camera
+  have been moved to. Without the table all is unlit.
 - `[[object]]`: see `scene_objects`.
 """
 
@@ -18,8 +18,9 @@ from typing import Any
 from warpfrag.errors import SceneError, shorten
 from warpfrag.files.examples import example_path
 from warpfrag.files.scene_objects import read_objects
-from warpfrag.files.table import Table, read_toml
+from warpfrag.files.table import Table, is_numbers, read_toml
 from warpfrag.scene.camera import Camera
+from warpfrag.scene.light import Light
 from warpfrag.scene.names import MERGES, MIXES
 from warpfrag.scene.scene import Scene
 
@@ -55,9 +56,8 @@ def load_scene(path: str | os.PathLike) -> Scene:
         "mix": top.choice("mix", MIXES),
         "background": _background(top),
     }
-    light = top.table("light", ("direction", "ambient"))
-    objects = read_objects(top, camera, light)
-    return Scene(camera, objects, **{key: value for key, value in values.items() if value is not None})
+    values["light"] = _light(top)
+    return Scene(camera, read_objects(top), **{key: value for key, value in values.items() if value is not None})
 
 
 def _camera(top: Table) -> Camera:
@@ -68,6 +68,17 @@ def _camera(top: Table) -> Camera:
         if key not in table:
             raise table.error(key, "none", "3 numbers")
     return read_camera(table)
+
+
+def _light(top: Table) -> Light | None:
+    table = top.table("light", ("direction", "ambient"))
+    if table is None:
+        return None
+    direction, ambient = table.data.get("direction", "camera"), table.number("ambient", 0.0, 1.0)
+    if direction != "camera" and (not is_numbers(direction, 3) or not any(direction)):
+        raise table.error("direction", shorten(direction), '3 numbers that are not all 0, or "camera"')
+    given: dict[str, Any] = {} if ambient is None else {"ambient": ambient}
+    return Light(None if direction == "camera" else tuple(direction), **given)
 
 
 def read_camera(table: Table, base: Camera | None = None) -> Camera:

@@ -7,31 +7,34 @@
 - `translate`, `rotate` ({axis, degrees} or a list of them, in order), `scale`, applied scale first and translate last,
   or `matrix` (4 rows);
 - `color`, `opacity`, `thickness` (a number, or `"2P"`: multiples of P(z), the default; of points `"10P"`);
+- `split` (of a mesh file: `"nodes"` or `"groups"`): an object for each node of a glTF or USD file, or each group of an
+  obj file, with its name there (after `name` and a dot, if that is given); `thickness` may then be a table with a value
+  for each of them, such as `{ lid = 0.1, box = "2P" }`;
 - `texture` (an image with sRGB colours, which `color` tints); `normals` (`"smooth"` or `"flat"`). Points have neither.
 
 A `color` replaces the file's colours and the colours of its images; an `opacity` replaces its alpha, but what an image
 cuts out (alpha 0) stays cut out.
 """
 
+from collections.abc import Container
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from warpfrag.errors import SceneError, is_number, range_wording, shorten
+from warpfrag.errors import SceneError, is_number, range_wording, shorten, suggest
 from warpfrag.files.images import ImageError, read_texture
-from warpfrag.files.meshes import load_mesh, warp_asset
+from warpfrag.files.meshes import load_mesh, load_parts, warp_asset
 from warpfrag.files.placement import PLACEMENT_KEYS, read_matrix
 from warpfrag.files.points import load_points
 from warpfrag.files.source import resolved
-from warpfrag.files.table import Table, is_numbers
-from warpfrag.scene.camera import Camera
+from warpfrag.files.table import LARGEST, Table, is_numbers
 from warpfrag.scene.names import CAMERA
 from warpfrag.scene.parameters import multiple_of_p
 from warpfrag.scene.surface import SceneObject
 from warpfrag.shapes import primitives
-from warpfrag.shapes.mesh import GREY, Mesh, lambert, smooth_normals, split_faces, transformed_normals
+from warpfrag.shapes.mesh import GREY, Mesh, smooth_normals, split_faces
 from warpfrag.shapes.surfels import surfels
 
 _OBJECT = ("name", *PLACEMENT_KEYS, "color", "opacity", "thickness", "texture", "normals")
@@ -47,6 +50,7 @@ _PRIMITIVES = {
 # What a disc has no use for: it is flat, and has no texture coordinates.
 _POINTS = ("points", "radius", "segments", *(key for key in _OBJECT if key not in ("texture", "normals")))
 _SHAPES = ("mesh", "primitive", "points")
+_SPLITS = ("nodes", "groups")
 # Beyond these a primitive is a slip of the keyboard: 4096 segments are 16 million triangles.
 _SEGMENTS, _CELLS = 4096, 4096
 # Of each disc: more are not rounder at any size worth a disc.
@@ -55,21 +59,17 @@ _DISC_SEGMENTS = 64
 
 @dataclass
 class _Reading:
-    """What the objects of one scene file have in common: the file, its camera and light, meshes read already."""
+    """What the objects of one scene file have in common: the file, meshes read already."""
 
     file: Path
-    camera: Camera
-    light: Table | None
-    meshes: dict[tuple, Mesh] = field(default_factory=dict)
+    meshes: dict[tuple, list[Mesh]] = field(default_factory=dict)
 
 
-def read_objects(top: Table, camera: Camera, light: Table | None) -> list[SceneObject]:
+def read_objects(top: Table) -> list[SceneObject]:
     """Read all objects of a scene file, in its order.
 
     Args:
         top: the table of the whole file.
-        camera: from whose eye light comes that has no direction.
-        light: the table `[light]`; None leaves all unlit.
 
     Raises:
         SceneError: a key, or a file that it names, cannot be used.
@@ -79,26 +79,30 @@ def read_objects(top: Table, camera: Camera, light: Table | None) -> list[SceneO
     if not isinstance(entries, list) or not entries:
         got = "none" if not entries else "one table"
         raise top.error("object", got, "one or more tables headed [[object]]")
-    reading = _Reading(Path(top.file), camera, light)
+    reading = _Reading(Path(top.file))
     objects: list[SceneObject] = []
+    owner: dict[str, int] = {}
     for index, entry in enumerate(entries):
-        item = _object(entry, index, reading)
-        place = f"{top.file}: object[{index}].name"
-        if item.name == CAMERA:
-            raise SceneError(f'{place}: got "camera", expected another: the camera has it')
-        for other, earlier in enumerate(objects):
-            if earlier.name == item.name:
-                got = f"{shorten(item.name)}, which object[{other}] has too"
+        for item in _objects(entry, index, reading):
+            place = f"{top.file}: object[{index}].name"
+            if "name" not in entry and item.name in owner:
+                # Nobody has named it: it takes the next number.
+                item = replace(item, name=_free_name(item.name, owner))
+            if item.name == CAMERA:
+                raise SceneError(f'{place}: got "camera", expected another: the camera has it')
+            if item.name in owner:
+                got = f"{shorten(item.name)}, which object[{owner[item.name]}] has too"
                 raise SceneError(f"{place}: got {got}, expected a name of its own")
-        objects.append(item)
+            owner[item.name] = index
+            objects.append(item)
     return objects
 
 
-def _object(entry: Any, index: int, reading: _Reading) -> SceneObject:
+def _objects(entry: Any, index: int, reading: _Reading) -> list[SceneObject]:
     path = f"object[{index}]"
     label = entry.get("name") if isinstance(entry, dict) else ""
     label = label if isinstance(label, str) else ""
-    every = (*_SHAPES, *_OBJECT, *sorted({key for keys in _PRIMITIVES.values() for key in keys}))
+    every = (*_SHAPES, "split", *_OBJECT, *sorted({key for keys in _PRIMITIVES.values() for key in keys}))
     table = Table(entry, reading.file, path, every, label)
     shapes = [key for key in _SHAPES if key in table]
     if len(shapes) != 1:
@@ -112,15 +116,52 @@ def _object(entry: Any, index: int, reading: _Reading) -> SceneObject:
         Table(entry, reading.file, path, _POINTS, label, "points")
         name, mesh = _surfels(table)
     else:
-        Table(entry, reading.file, path, ("mesh", *_OBJECT), label, "a mesh")
-        name, mesh = _mesh(table, reading)
+        Table(entry, reading.file, path, ("mesh", "split", *_OBJECT), label, "a mesh")
+        name, parts = _meshes(table, reading)
+        if "split" in table:
+            return _split(table, name, parts, reading)
+        (mesh,) = parts
     name = table.text("name") or name
     table.label = name
-    return _scene_object(table, name, mesh, reading)
+    return [_scene_object(table, name, mesh, reading, table.data.get("thickness"))]
 
 
-def _scene_object(table: Table, name: str, mesh: Mesh, reading: _Reading) -> SceneObject:
-    """Return a mesh in its place, with its table's look."""
+def _split(table: Table, stem: str, parts: list[Mesh], reading: _Reading) -> list[SceneObject]:
+    """Return an object for each part of a mesh file."""
+    prefix = table.text("name")
+    thickness = table.data.get("thickness")
+    names = _names_of_parts(parts, stem)
+    if isinstance(thickness, dict):
+        for key in thickness:
+            if key not in names:
+                raise table.error(f"thickness.{key}", "an unknown name", f"one of a part; {suggest(key, names)}")
+    objects = []
+    for name, mesh in zip(names, parts, strict=True):
+        own = thickness.get(name) if isinstance(thickness, dict) else thickness
+        objects.append(_scene_object(table, f"{prefix}.{name}" if prefix else name, mesh, reading, own))
+    return objects
+
+
+def _names_of_parts(parts: list[Mesh], stem: str) -> list[str]:
+    """Return a name of its own for each part: that of the file, on one line, numbered where it is taken."""
+    names: list[str] = []
+    for part in parts:
+        plain = " ".join(part.name.split()) or stem
+        names.append(_free_name(plain, [*names, CAMERA]))
+    return names
+
+
+def _free_name(name: str, taken: Container[str]) -> str:
+    """Return a name, with the least number that makes it one of its own."""
+    free, number = name, 1
+    while free in taken:
+        number += 1
+        free = f"{name} {number}"
+    return free
+
+
+def _scene_object(table: Table, name: str, mesh: Mesh, reading: _Reading, thickness_value: Any) -> SceneObject:
+    """Return a mesh in its place, with its table's look and a z-thickness as the file has it (None for the default)."""
     matrix = read_matrix(table)
     normals = table.choice("normals", ("smooth", "flat"))
     if normals == "flat":
@@ -129,10 +170,11 @@ def _scene_object(table: Table, name: str, mesh: Mesh, reading: _Reading) -> Sce
         mesh = replace(mesh, normals=smooth_normals(mesh.vertices, mesh.faces))
     mesh = _look(table, mesh)
     # Discs of one surface overlap at angles to one another: the paper gives them more than its 2·P(z).
-    thickness, unit = _thickness(table, "10P" if "points" in table else "2P")
+    default = "10P" if "points" in table else "2P"
+    thickness, unit = _thickness(table, default if thickness_value is None else thickness_value)
     color = np.full(3, 1.0 if mesh.textures else GREY) if mesh.color is None else mesh.color
     try:
-        item = SceneObject(
+        return SceneObject(
             name,
             mesh.vertices,
             mesh.faces,
@@ -144,21 +186,20 @@ def _scene_object(table: Table, name: str, mesh: Mesh, reading: _Reading) -> Sce
             mesh.uv if mesh.textures else None,
             (mesh.textures if mesh.texture_index is not None else mesh.textures[0]) if mesh.textures else None,
             mesh.texture_index if mesh.textures else None,
+            normals=mesh.normals,
         )
     except ValueError as error:
         raise table.prefixed("", error) from None
-    if reading.light is not None:
-        item.shade = _shade(reading.light, reading.camera, item, mesh)
-    return item
 
 
-def _mesh(table: Table, reading: _Reading) -> tuple[str, Mesh]:
-    text = str(table.text("mesh"))
+def _meshes(table: Table, reading: _Reading) -> tuple[str, list[Mesh]]:
+    """Return the stem of a mesh file's name and its parts: one, but where `split` is given."""
+    text, split = str(table.text("mesh")), table.choice("split", _SPLITS)
     try:
         path, root = (warp_asset(text), None) if text.startswith("warp:") else _inside(table, "mesh", text)
-        key = path, root
+        key = path, root, split is None
         if key not in reading.meshes:
-            reading.meshes[key] = load_mesh(path, root)
+            reading.meshes[key] = [load_mesh(path, root)] if split is None else load_parts(path, root)
     except SceneError:
         raise
     except (ValueError, OSError) as error:
@@ -250,28 +291,12 @@ def _image(table: Table) -> np.ndarray:
         raise table.prefixed("texture", error) from error
 
 
-def _thickness(table: Table, default: str) -> tuple[float, Any]:
-    value = table.data.get("thickness", default)
+def _thickness(table: Table, value: Any) -> tuple[float, Any]:
     multiple = multiple_of_p(value) if isinstance(value, str) else None
     if multiple is not None and np.isfinite(multiple):
         return multiple, "P"
     if isinstance(value, str) or not is_number(value) or value < 0:
         raise table.error("thickness", shorten(value), range_wording(0.0) + ', or multiples of P(z) like "2P"')
-    thickness = table.number("thickness", 0.0)
-    assert thickness is not None
-    return thickness, "scene"
-
-
-def _shade(light: Table, camera: Camera, item: SceneObject, mesh: Mesh) -> np.ndarray:
-    direction = light.data.get("direction", "camera")
-    ambient = light.number("ambient", 0.0, 1.0)
-    if direction != "camera" and (not is_numbers(direction, 3) or not any(direction)):
-        raise light.error("direction", shorten(direction), '3 numbers that are not all 0, or "camera"')
-    if direction != "camera":
-        towards = np.array(direction, dtype=np.float64)
-    elif camera.is_perspective:
-        towards = np.asarray(camera.eye) - item.world_vertices()
-    else:
-        towards = np.subtract(camera.eye, camera.target)
-    assert mesh.normals is not None
-    return lambert(transformed_normals(mesh.normals, item.matrix), towards, 0.3 if ambient is None else ambient)
+    if value > LARGEST:
+        raise table.error("thickness", shorten(value), range_wording(0.0, LARGEST))
+    return float(value), "scene"

@@ -14,7 +14,7 @@ from warpfrag.shapes.mesh import GREY, Mesh, unshared, weld
 
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _HEADER = 84
-_VERTEX = re.compile(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)")
+_VERTEX = re.compile(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
 _MAGICS = b"COLOR="
 _FLAG = 0x8000
 
@@ -43,7 +43,7 @@ def read_stl(source: Source) -> tuple[list[Mesh], str]:
 
 def _is_text(data: bytes, count: int) -> bool:
     exact = len(data) == _HEADER + count * _TRIANGLE.itemsize
-    return not exact and data.lstrip()[:5].lower() == b"solid" and b"facet" in data[:1000]
+    return not exact and data.lstrip()[:5].lower() == b"solid" and b"facet" in data[:1000].lower()
 
 
 def _welded(corners: np.ndarray) -> Mesh:

@@ -7,6 +7,7 @@ faces, else displayColor and displayOpacity (linear), inherited ones too; its im
 """
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -24,6 +25,7 @@ from warpfrag.shapes.mesh import GREY, Mesh, placed
 # Limits of the process that reads: address space, and time, which grows with the size of the file.
 MOST_BYTES = 4 * 2**30
 MOST_SECONDS, BYTES_PER_SECOND = 60.0, 10 * 2**20
+_MISSING = re.compile(r"Could not open asset @([^@]*)@")
 SCRIPT = Path(__file__).with_name("usd_stage.py")
 
 
@@ -50,6 +52,8 @@ def read_usd(source: Source) -> tuple[list[Mesh], str]:
         mesh = _mesh(entry, own)
         if mesh is not None:
             parts.append(mesh)
+    for name in dict.fromkeys(told["missing"]):
+        source.find(name)
     for note in told["notes"]:
         source.note(note)
     kinds = told["kinds"]
@@ -79,7 +83,10 @@ def _run(source: Source) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
             raise ValueError(_memory() if "MemoryError" in str(words) else " ".join(words)[:160] or "its reader failed")
         with np.load(output, allow_pickle=False) as stored:
             arrays = {key: stored[key] for key in stored.files}
-    return json.loads(str(arrays.pop("told"))), arrays
+    told = json.loads(str(arrays.pop("told")))
+    # References that lead nowhere are told by USD on standard error alone.
+    told["missing"] = _MISSING.findall(done.stderr.decode("utf-8", "replace"))
+    return told, arrays
 
 
 def _memory() -> str:

@@ -78,6 +78,7 @@ class _Course:
         stage: of the maps' grids.
         stage_end: steps from this start after which the stage ends.
         scores: losses in this stage that the stopping rule goes by.
+        scale: what L-BFGS divides losses by, its first; 0 before.
     """
 
     begin: int
@@ -87,6 +88,7 @@ class _Course:
     stage: int = 0
     stage_end: int = 0
     scores: list[float] = field(default_factory=list)
+    scale: float = 0.0
 
     def to_state(self) -> dict[str, Any]:
         """Return it as a checkpoint keeps it."""
@@ -234,17 +236,26 @@ class Descent(ABC):
     def full_loss(self) -> float:
         """Return the loss of all views, prior included, without a gradient."""
         with self.torch.no_grad():
-            values, priors = self._values_and_priors()
-            mine = self.problem.processes.share(list(range(len(self.problem.views))))
-            views = [self.problem.views[index] for index in mine]
-            total = sum(float(view.loss(view.image(values))) for view in views) / len(self.problem.views)
+            return self._loss_of(*self._values_and_priors())
+
+    def loss_at(self, coordinates: np.ndarray) -> float:
+        """Return the same at some coordinates."""
+        with self.torch.no_grad(), _one_torch_thread():
+            moved = [
+                (each, self.torch.as_tensor(coordinates[place].reshape(fitted.start.shape), device=each.device))
+                for each, (fitted, place) in zip(self.coordinates, with_places(self.study.parameters), strict=True)
+            ]
+            return self._loss_of(*_values_and_priors(moved))
+
+    def _loss_of(self, values: Mapping[str, Any], priors: list[Any]) -> float:
+        mine = self.problem.processes.share(list(range(len(self.problem.views))))
+        views = [self.problem.views[index] for index in mine]
+        total = sum(float(view.loss(view.image(values))) for view in views) / len(self.problem.views)
         return float(self.problem.processes.sum(np.array([total]))[0]) + sum(float(prior) for prior in priors)
 
     def _values_and_priors(self) -> tuple[dict[str, Any], list[Any]]:
         """Return the parameters by name, and the priors of those that have one, differentiable in the leaves."""
-        moved = [(coordinate, coordinate.coordinate()) for coordinate in self.coordinates]
-        values = {each.fitted.name: each.fitted.to_value(tensor) for each, tensor in moved}
-        return values, [each.smoothness(tensor) for each, tensor in moved if each.smoothness]
+        return _values_and_priors([(coordinate, coordinate.coordinate()) for coordinate in self.coordinates])
 
     def vector(self) -> np.ndarray:
         """Return all coordinates as one vector."""
@@ -289,6 +300,11 @@ class Descent(ABC):
             coordinate.leaf.data.copy_(leaf)
         self.torch_optimizer.load_state_dict(state["optimizer"])
         self.session.losses += state["losses"]
+
+
+def _values_and_priors(moved: list[tuple[_Coordinate, Any]]) -> tuple[dict[str, Any], list[Any]]:
+    values = {each.fitted.name: each.fitted.to_value(tensor) for each, tensor in moved}
+    return values, [each.smoothness(tensor) for each, tensor in moved if each.smoothness]
 
 
 class Adam(Descent):
@@ -345,7 +361,11 @@ class Adam(Descent):
 
 
 class LBFGS(Descent):
-    """L-BFGS with a strong Wolfe line search."""
+    """L-BFGS with a strong Wolfe line search.
+
+    Its first step is as long as the gradient: of losses divided by the first one, so that how small they are does not
+    matter.
+    """
 
     bent = True
 
@@ -365,7 +385,9 @@ class LBFGS(Descent):
 
     def step(self) -> float:
         """Take one step and return the loss before it."""
-        return float(self.torch_optimizer.step(self._closure))
+        self.losses: list[float] = []
+        self.torch_optimizer.step(self._closure)
+        return self.losses[0]
 
     def settled(self) -> str | None:
         """Return why the stage has come to its end, if it has."""
@@ -379,7 +401,11 @@ class LBFGS(Descent):
     def _closure(self) -> float:
         loss = self.evaluate(list(range(len(self.problem.views))))
         self.keep(loss)
-        return loss
+        self.losses.append(loss)
+        self.course.scale = self.course.scale or loss or 1.0
+        for coordinate in self.coordinates:
+            coordinate.leaf.grad /= self.course.scale
+        return loss / self.course.scale
 
 
 @contextmanager

@@ -56,7 +56,6 @@ class LeastSquares:
         """Fit from a start."""
         study, begin = self.problem.study, len(self.session.losses)
         lower, upper = self.problem.bounds()
-        # SciPy moves a start on a bound into the inside by itself.
         found = self.optimize.least_squares(
             self._residuals,
             start,
@@ -80,6 +79,10 @@ class LeastSquares:
             converged=found.status > 0,
             reason=_REASONS[found.status],
         )
+
+    def loss_at(self, coordinates: np.ndarray) -> float:
+        """Return the loss at some coordinates."""
+        return Evaluation(self.problem, self.loss, coordinates).cost * self.loss.factor
 
     def _state(self) -> dict[str, Any]:
         """Return everything as arrays."""

@@ -30,14 +30,14 @@ def draw_error(view: ViewResult, path: Path) -> None:
     # Panels 4 inches wide, higher or lower as the image is, within reason.
     tall = float(np.clip(4.0 * height / width, 2.0, 7.0))
     label = "|image − reference|, largest of the channels, linear light"
+    # One scale for both: a fit that changed little shows it.
+    top = max(float(error.max(initial=0.0)) for _, error in panels) or 1.0
     with matplotlib.rc_context(_STYLE):
         figure = figure_class(figsize=(10.4, tall + 0.4), layout="constrained")
         axes = figure.subplots(1, 2)
         for axis, (title, error) in zip(axes, panels, strict=True):
             root = float(np.sqrt(np.mean(np.square(error, dtype=np.float64))))
             largest = error.max(axis=2)
-            # Each panel has its own scale: the end is often a thousandth of the start.
-            top = float(largest.max()) or 1.0
             shown = axis.imshow(largest, cmap="inferno", vmin=0.0, vmax=top, interpolation="nearest")
             axis.set_title(f"Absolute error {title} (rms {root:.2g}, largest {largest.max():.2g})")
             axis.set_xticks([])

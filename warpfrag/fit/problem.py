@@ -26,8 +26,10 @@ from warpfrag.scene.parameters import BETA
 from warpfrag.scene.scene import Scene
 from warpfrag.storage.kbuffer import kbuffer
 
-# Random starts keep this share of the range away from the bounds.
+# Random starts keep this share of the range away from the bounds, and a study's own this one where no method moves away
+# from a bound.
 _MARGIN = 0.1
+INSIDE = 1e-3
 
 
 class ViewProblem:
@@ -77,6 +79,10 @@ class ViewProblem:
         if kind_of(beta) not in (None, NUMPY) and kind_of(fragments.rgba) is NUMPY:
             fragments = fragments.torch(beta.device)
         return self.over_background(self.composite(fragments, beta))
+
+    def sees_something(self, image: np.ndarray) -> bool:
+        """Tell whether any object is in an image of this view."""
+        return bool((image != np.asarray(self.scene.background, image.dtype)).any()) or bool(self.coverage.count)
 
     def composite(self, fragments: Fragments, beta: Any) -> Any:
         """Composite fragments as the scene says, without its background."""
@@ -133,6 +139,13 @@ class Problem:
         spans = [np.tile(each.coordinate_bounds, (each.start.size, 1)) for each in self.study.parameters]
         lower, upper = np.concatenate(spans).T
         return lower, upper
+
+    def inside(self, coordinates: np.ndarray) -> np.ndarray:
+        """Return a vector of coordinates with those on their bounds moved in by a thousandth of the range."""
+        lower, upper = self.bounds()
+        bounded = np.isfinite(lower) & np.isfinite(upper)
+        room = INSIDE * np.subtract(upper, lower, out=np.zeros_like(upper), where=bounded)
+        return np.clip(coordinates, lower + room, upper - room)
 
     def starts(self) -> list[np.ndarray]:
         """Return the study's start and the random ones.

@@ -7,6 +7,7 @@ import numpy as np
 
 from warpfrag.fit.losses import psnr
 from warpfrag.fit.parameters import value_wording
+from warpfrag.scene.parameters import kind_named
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +71,9 @@ class FitResult:
             of the residuals; inf where the image does not depend on it. None unless every parameter is global.
         condition_number: of the Jacobian (thicknesses as logarithms); None unless every parameter is global.
         undetermined: names of the parameters the image does not determine, see `warpfrag.fit.certainty.assess`.
+        unseen: names of those with which the images change, but by what this gradient does not see: outlines that move,
+            or jumps.
+        notes: what else there is to know, a sentence each.
         loss: the least loss.
         losses: the loss of each step from the start that led there.
         evaluations: times that the images were computed, from all starts.
@@ -96,6 +100,8 @@ class FitResult:
     views: tuple[ViewResult, ...] = field(repr=False)
     runs: tuple[Run, ...] = field(repr=False)
     setting: dict[str, Any] = field(default_factory=dict)
+    unseen: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
     @property
     def reference(self) -> np.ndarray:
@@ -138,18 +144,28 @@ class FitResult:
                 line += f" ± {float(self.standard_errors[name]):.2g}"
             if self.true is not None and errors is not None:
                 line += f" (true {value_wording(self.true[name])}, off by {100.0 * errors[name]:.3g} %)"
-            if any(part == name or part.startswith(f"{name}[") for part in self.undetermined):
+            if _names(self.undetermined, name):
                 line += " — not determined by this image"
+            elif _names(self.unseen, name):
+                moves = kind_named(name).moves is not None
+                outlines = "its outlines move; this gradient holds coverage fixed"
+                line += " — " + (outlines if moves else "the images change with it by what this gradient does not see")
             lines.append(line)
         if len(self.views) > 1:
             lines += [f"{v.name}{' (held out)' if v.held_out else ''}: PSNR {v.psnr:.2f} dB" for v in self.views]
         if len(self.runs) > 1:
             lines.append(f"losses from {len(self.runs)} starts: " + ", ".join(f"{run.loss:.3g}" for run in self.runs))
+        lines += self.notes
         state = "converged" if self.converged else "stopped"
         end = f"{state}: {self.reason}; loss {self.loss:.3g}, {self.steps} steps, {self.seconds:.1f} s"
         if self.condition_number is not None:
             end += f", condition number {self.condition_number:.3g}"
         return [*lines, end]
+
+
+def _names(components: tuple[str, ...], name: str) -> bool:
+    """Tell whether a parameter, or a number of it, is among some names."""
+    return any(part == name or part.startswith(f"{name}[") for part in components)
 
 
 def plain_value(value: Any) -> Any:

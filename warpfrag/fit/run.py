@@ -4,6 +4,7 @@ import os
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +17,17 @@ from warpfrag.fit.descent import LBFGS, Adam
 from warpfrag.fit.jacobian import Evaluation
 from warpfrag.fit.least_squares import LeastSquares
 from warpfrag.fit.losses import RobustLoss
-from warpfrag.fit.parameters import with_places
+from warpfrag.fit.parameters import value_wording, with_places
 from warpfrag.fit.problem import Problem
 from warpfrag.fit.processes import is_first_process
 from warpfrag.fit.progress import progress_bar
 from warpfrag.fit.result import FitResult, ViewResult, plain_value
 from warpfrag.fit.saving import save_result
+from warpfrag.fit.second_look import JUMPS, falling_steps, unseen_changes
 from warpfrag.fit.session import CHECKPOINT, FitError, Progress, Session, fingerprint
 from warpfrag.fit.study import PreparedStudy, Study
 from warpfrag.fit.study_file import load_study
+from warpfrag.scene.visibility import why_empty
 
 METHODS: dict[str, Any] = {"least_squares": LeastSquares, "adam": Adam, "lbfgs": LBFGS}
 
@@ -99,13 +102,23 @@ def _run(study: Study, resume: bool, output: Path | None, report: Callable[[Prog
         assert output is not None
         session.load(output)
     before = _images(problem, problem.values(problem.start()))
+    notes: list[str] = []
     with session.interruptible():
         method = METHODS[prepared.method](problem, session)
-        runs = [method.run(start) for start in problem.starts()]
+        runs = [method.run(start) for start in _starts(problem, notes)]
         session.save()
     best = min(runs, key=lambda run: run.loss)
+    notes += [
+        f"{view.view.name}: {why_empty(view.scene)}"
+        for view, image in zip([*problem.views, *problem.held_out], before, strict=True)
+        if not view.sees_something(image)
+    ]
+    falling = falling_steps(problem, method, best.coordinates, best.loss) if best.converged else []
+    if falling:
+        reason = f"{best.reason}; yet a step of a thousandth of its range lowers the loss in {', '.join(falling)}"
+        best = replace(best, converged=False, reason=reason)
     found = problem.values(best.coordinates)
-    errors, condition, undetermined = _certainty(problem, best.coordinates, found)
+    certainty = _certainty(problem, best.coordinates, found, notes)
     after = _images(problem, found)
     views = [
         ViewResult(view.view.name, view.view.held_out, view.reference, *images)
@@ -116,9 +129,9 @@ def _run(study: Study, resume: bool, output: Path | None, report: Callable[[Prog
         start={each.name: plain_value(each.start) for each in prepared.parameters},
         found=best.found,
         true=None if true is None else {name: plain_value(value) for name, value in true.items()},
-        standard_errors=errors,
-        condition_number=condition,
-        undetermined=undetermined,
+        standard_errors=certainty.standard_errors,
+        condition_number=certainty.condition_number,
+        undetermined=certainty.undetermined,
         loss=best.loss,
         losses=best.losses,
         evaluations=sum(run.evaluations for run in runs),
@@ -128,6 +141,8 @@ def _run(study: Study, resume: bool, output: Path | None, report: Callable[[Prog
         views=tuple(views),
         runs=tuple(runs),
         setting=_setting(prepared, problem.processes.count),
+        unseen=certainty.unseen,
+        notes=tuple(notes),
     )
 
 
@@ -135,22 +150,50 @@ def _images(problem: Problem, values: dict[str, Any]) -> list[np.ndarray]:
     return [np.asarray(view.image(values)) for view in (*problem.views, *problem.held_out)]
 
 
-def _certainty(
-    problem: Problem, coordinates: np.ndarray, found: dict[str, Any]
-) -> tuple[dict[str, Any] | None, float | None, tuple[str, ...]]:
-    """Return standard errors, condition number and what is undetermined; nothing where some parameter is not global."""
+@dataclass(frozen=True)
+class _Certainty:
+    """How well parameters are known, by name; see `FitResult`."""
+
+    standard_errors: dict[str, Any] | None = None
+    condition_number: float | None = None
+    undetermined: tuple[str, ...] = ()
+    unseen: tuple[str, ...] = ()
+
+
+def _certainty(problem: Problem, coordinates: np.ndarray, found: dict[str, Any], notes: list[str]) -> _Certainty:
+    """Return how well parameters are known; nothing where some of them are not global."""
     study = problem.study
     if not study.is_global:
-        return None, None, ()
+        return _Certainty()
     # Whatever the loss: how far images may differ by noise is a matter of squares, at the scale that has the noise.
     evaluation = Evaluation(problem, RobustLoss.named("l2", study.asked.delta), coordinates, scales=1)
     residual_count = sum(view.reference.size for view in problem.views)
     certainty = assess(evaluation.compress(), study.parameters, residual_count, *evaluation.covered_residuals())
+    unseen = unseen_changes(problem, coordinates, evaluation, set(certainty.undetermined))
+    if unseen.jumps > JUMPS:
+        notes.append(
+            f'merge "smooth" jumps where slabs begin to overlap: {100.0 * unseen.jumps:.0f} % of the images\' change '
+            'with thickness is not in the gradient; merge = "exact" has no jumps'
+        )
     errors = {}
     for each, place in with_places(study.parameters):
         error = certainty.standard_errors[place].reshape(each.start.shape)
         errors[each.name] = plain_value(error * (found[each.name] if each.is_logarithmic else each.unit))
-    return errors, certainty.condition_number, certainty.undetermined
+    undetermined = tuple(name for name in certainty.undetermined if name not in unseen.components)
+    return _Certainty(errors, certainty.condition_number, undetermined, unseen.components)
+
+
+def _starts(problem: Problem, notes: list[str]) -> list[np.ndarray]:
+    """Return where a method starts from, inside of bounds where it would not move away from them."""
+    starts = problem.starts()
+    if problem.study.method == "adam":
+        return starts
+    inside = problem.inside(starts[0])
+    for each, place in with_places(problem.study.parameters):
+        if (inside[place] != starts[0][place]).any():
+            at = value_wording(each.to_value(inside[place].reshape(each.start.shape)))
+            notes.append(f"{each.name}: the start lies on a bound, from which this method does not move; began at {at}")
+    return [inside, *starts[1:]]
 
 
 def _setting(study: PreparedStudy, processes: int) -> dict[str, Any]:

@@ -54,6 +54,8 @@ def to_json(result: FitResult, arrays: dict[str, np.ndarray] | None = None) -> d
         "standard_errors": _plain_values("standard_errors", result.standard_errors, arrays),
         "condition_number": _plain(result.condition_number),
         "undetermined": list(result.undetermined),
+        "unseen": list(result.unseen),
+        "notes": list(result.notes),
         "loss": _plain(result.loss),
         "losses": _plain(list(result.losses)),
         "steps": result.steps,

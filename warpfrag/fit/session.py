@@ -211,11 +211,12 @@ def fingerprint(study: Study, references: Sequence[np.ndarray]) -> str:
 
     prepared = study.prepared
     scene = prepared.scene
-    add(scene.background, scene.beta, scene.layers, scene.merge, scene.mix, study.resolve)
+    add(scene.background, scene.beta, scene.layers, scene.merge, scene.mix, scene.light, study.resolve)
     add(*(view.camera for view in prepared.fitted_views), *references)
     for item in scene.objects:
         add(item.name, item.thickness_unit, item.faces, item.matrix)
-        for value in (item.vertices, item.color, item.opacity, item.thickness, item.uv, item.texture_index, item.shade):
+        own = (item.vertices, item.color, item.opacity, item.thickness, item.uv, item.texture_index, item.shade)
+        for value in (*own, item.normals):
             add(None if value is None else np.asarray(value))
         add(*item.textures)
     for each in prepared.parameters:

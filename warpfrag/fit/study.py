@@ -1,11 +1,13 @@
 """Studies: what is fitted to which images, and how. `study_file` reads them from TOML."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal, get_args
 
 import numpy as np
+import warp as wp
 
 from warpfrag.errors import check_choice, check_number, check_whole, shorten
 from warpfrag.fit.losses import ImageLoss
@@ -128,8 +130,24 @@ class Study:
             check_number(key, getattr(self, key), above=0.0)
         for key in ("tolerance", "checkpoint_seconds"):
             check_number(key, getattr(self, key), 0.0)
+        check_device(self.device)
         if not self.parameters:
             raise StudyError("parameters: got none, expected at least one to fit")
+
+
+def check_device(device: Any) -> None:
+    """Check that a device is one of this machine.
+
+    Raises:
+        StudyError: it is not.
+    """
+    match = re.fullmatch(r"cpu|cuda(?::(\d+))?", device) if isinstance(device, str) else None
+    if match is None:
+        raise StudyError(f'device: got {shorten(device)}, expected "cpu", "cuda" or "cuda:<number>"')
+    count = 0 if device == "cpu" else wp.get_cuda_device_count()
+    if device != "cpu" and int(match[1] or 0) >= count:
+        here = f"{count} CUDA devices" if count else "no CUDA device"
+        raise StudyError(f'device: got "{device}" on a machine with {here}, expected another, such as "cpu"')
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,8 +186,8 @@ class PreparedStudy:
 
     @property
     def is_global(self) -> bool:
-        """Whether every parameter is few values, for a whole object, scene or view."""
-        return all(each.is_global for each in self.parameters)
+        """Whether every parameter is few values with columns in the Jacobian."""
+        return all(each.is_global and each.kind.in_jacobian for each in self.parameters)
 
     @property
     def true(self) -> dict[str, np.ndarray] | None:
@@ -249,12 +267,12 @@ def _check_held_out(views: Sequence[View], parameters: Sequence[FittedParameter]
 def _chosen_method(study: Study, parameters: Sequence[FittedParameter], image_loss: ImageLoss) -> Method:
     """Return the method of a study, its own or the default, once it is known to go with all else."""
     robust = image_loss.robust is not None
-    other = next((each.name for each in parameters if not each.is_global), None)
+    other = next((each.name for each in parameters if not (each.is_global and each.kind.in_jacobian)), None)
     method = study.method
     if method is None:
         method = "least_squares" if other is None and robust and study.batch is None else "adam"
     if method == "least_squares" and other is not None:
-        expected = '"adam" or "lbfgs" (least squares fits few values per object)'
+        expected = '"adam" or "lbfgs" (least squares fits few values per object, and no lens)'
         raise StudyError(f'method: got "least_squares" for {other}, expected {expected}')
     if method == "least_squares" and not robust:
         raise StudyError(f'loss: got {shorten(study.loss)} with "least_squares", expected "l2", "l1" or "huber"')

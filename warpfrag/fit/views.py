@@ -136,7 +136,7 @@ def check_reference(view: View, scene: Scene, count: int, resolve: Resolve) -> N
         for name in reference.true:
             check_name(name, known, "reference.true")
         scene, true = scene.in_units_of(reference.of_view(0, count), "reference.true")
-        assemble(scene, true, camera=view.camera)
+        assemble(scene, true, camera=view.camera, bounds="error")
         _check_beta(reference.true.get(BETA.key, 0.0), view.camera, count)
     else:
         if reference.supersampling != 1 or reference.render_options:

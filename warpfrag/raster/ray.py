@@ -60,6 +60,8 @@ class Window:
         far: planar depth of the far plane [scene units].
         width: columns of the image.
         height: rows of the whole image.
+        middle_x: where the line of sight meets the image, from its left edge [pixels].
+        middle_y: the same from its top edge [pixels].
         first_row: first row of the window.
         row_count: number of rows of the window.
     """
@@ -70,6 +72,8 @@ class Window:
     far: float
     width: int
     height: int
+    middle_x: float
+    middle_y: float
     first_row: int
     row_count: int
 
@@ -80,7 +84,10 @@ class Window:
         begin, end = rows or (0, height)
         scale = camera.focal if camera.is_perspective else 1.0 / camera.pixel_size
         perspective = int(camera.is_perspective)
-        return Window(scale, perspective, camera.near, camera.far, width, height, begin, end - begin)
+        middle_x, middle_y = camera.middle
+        return Window(
+            scale, perspective, camera.near, camera.far, width, height, middle_x, middle_y, begin, end - begin
+        )
 
     @property
     def pixel_count(self) -> int:
@@ -91,7 +98,7 @@ class Window:
         """Return the window as kernels take it."""
         rays = Rays()
         rays.scale, rays.perspective, rays.near, rays.far = self.scale, self.perspective, self.near, self.far
-        rays.middle_x, rays.middle_y = 0.5 * self.width, 0.5 * self.height
+        rays.middle_x, rays.middle_y = self.middle_x, self.middle_y
         rays.width, rays.first_row, rays.row_count = self.width, self.first_row, self.row_count
         return rays
 

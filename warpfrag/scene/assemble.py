@@ -2,8 +2,8 @@
 
 Differentiable, with torch overrides: world vertices in `"<name>.vertices"`, `"<name>.translation"` and
 `"<name>.rotation"`, colour, opacity and thickness in theirs. Frozen: faces, transforms, the point about which an object
-turns, textures and baked factors of the colours. What captures the geometry holds coverage fixed as well: a gradient in
-vertices or poses moves depths and attributes inside outlines, not the outlines.
+turns, textures and the factors of light (see `light`). What captures the geometry holds coverage fixed as well: a
+gradient in vertices or poses moves depths and attributes inside outlines, not the outlines.
 
 Coordinates are computed in float64 from the object's own vertices, its matrix and its pose, component by component:
 NumPy and torch round alike, and no matrix product is left to what autocast makes of it.
@@ -16,11 +16,24 @@ from typing import Any, Literal
 import numpy as np
 
 from warpfrag.arrays.kinds import NUMPY, Kind, dtype_name, kind_of
-from warpfrag.errors import shorten
+from warpfrag.errors import check_choice, shorten
 from warpfrag.scene.camera import Camera
+from warpfrag.scene.lens import Lens, through_lens
+from warpfrag.scene.light import transformed_normals, turned_normals
 from warpfrag.scene.names import CAMERA, POSE_KEYS
-from warpfrag.scene.parameters import COLOR, COMMON_THICKNESS, OPACITY, THICKNESS, VERTICES, Parameter, check_name
+from warpfrag.scene.parameters import (
+    BOUNDS,
+    COLOR,
+    COMMON_THICKNESS,
+    OPACITY,
+    THICKNESS,
+    VERTICES,
+    Bounds,
+    Parameter,
+    check_name,
+)
 from warpfrag.scene.pose import move_object
+from warpfrag.scene.rotation import rotation_matrix
 from warpfrag.scene.scene import Scene
 from warpfrag.scene.surface import SceneObject
 
@@ -34,7 +47,7 @@ class Geometry:
     Attributes:
         vertices: world space [scene units], (V, 3) float64, whatever the precision of the image.
         faces: indices into `vertices`, (N, 3) int32 NumPy; objects one after the other, in submission order.
-        rgba: straight colour (shade included) and opacity, without textures, (V, 4).
+        rgba: straight colour (shade and light included) and opacity, without textures, (V, 4).
         thickness: z-thickness (V,), in scene units or multiples of P(z) as `thickness_in_p` says; 0 where there is a
             map.
         object_id: object of each face, (N,) int32 NumPy.
@@ -46,6 +59,8 @@ class Geometry:
         thickness_maps: z-thickness per pixel (H, W), by object index, for the objects that have a map.
         thickness_in_p: whether the thickness of each object is in multiples of P(z), (objects,) bool NumPy.
         precision: of the image, and of `rgba`, `thickness` and the maps.
+        camera: the camera, with the lens that parameters give it.
+        lens: how points in camera space move with that; None without gradients.
         camera_pose: how the camera is moved: translation [scene units] and rotation vector [degrees] in its own axes,
             (3,) float64 each; None where it stays.
     """
@@ -61,6 +76,8 @@ class Geometry:
     textures: list[np.ndarray]
     thickness_maps: dict[int, Any]
     thickness_in_p: np.ndarray
+    camera: Camera
+    lens: Lens | None = None
     precision: Precision = "float32"
     camera_pose: tuple[Any, Any] | None = None
 
@@ -120,7 +137,13 @@ class Frame:
         return self.kind.asarray(np.asarray(value, np.float64), self.kind.astype(self.like, "float64"))
 
 
-def assemble(scene: Scene, parameters: Mapping[str, Any] | None = None, *, camera: Camera | None = None) -> Geometry:
+def assemble(
+    scene: Scene,
+    parameters: Mapping[str, Any] | None = None,
+    *,
+    camera: Camera | None = None,
+    bounds: Bounds = "clamp",
+) -> Geometry:
     """Flatten a scene, with parameter overrides applied.
 
     Args:
@@ -130,6 +153,8 @@ def assemble(scene: Scene, parameters: Mapping[str, Any] | None = None, *, camer
             map. `"thickness"` without a name, one number or a map, is that of all objects without one of their own
             here. `"beta"` is let through.
         camera: whose pixel grid thickness maps must have; default the scene's.
+        bounds: what becomes of parameters out of their range: "clamp" puts them on its end, with a gradient that leads
+            back in but not farther out; "error" refuses them.
 
     Returns:
         Arrays as torch tensors, differentiable in the overrides, if any override is a tensor, else NumPy. The image is
@@ -144,27 +169,39 @@ def assemble(scene: Scene, parameters: Mapping[str, Any] | None = None, *, camer
         >>> assemble(scene, {"ball.opacity": 0.5}).rgba[0]
         array([0.8, 0.8, 0.8, 0.5], dtype=float32)
     """
+    check_choice("bounds", bounds, BOUNDS)
     camera = camera or scene.camera
     known = scene.described()
     scene, overrides = _checked(scene, parameters or {}, known)
     frame = Frame.of(overrides, known)
+    camera, lens = through_lens(camera, overrides, known, bounds, frame.double)
     if COMMON_THICKNESS.key in overrides:
         # One array for all: a map is then there once.
-        common = overrides[COMMON_THICKNESS.key] = frame.array(overrides[COMMON_THICKNESS.key])
+        common = known[COMMON_THICKNESS.key].bounded(frame.array(overrides[COMMON_THICKNESS.key]), bounds)
         known[COMMON_THICKNESS.key].check(common, camera.shape)
+        overrides[COMMON_THICKNESS.key] = common
     vertices, rgba, thickness, faces, uv, texture_id = [], [], [], [], [], []
     textures: list[np.ndarray] = []
     thickness_maps: dict[int, Any] = {}
     first_vertex = 0
     textured = any(item.texture is not None for item in scene.objects)
     xp = frame.kind.xp
+    camera_pose = _pose(CAMERA, overrides, known, frame)
+    # The camera as light goes with it.
+    eye = camera if camera_pose is None else camera.moved(*(frame.kind.to_numpy(value) for value in camera_pose))
     for index, item in enumerate(scene.objects):
-        values = _values(item, overrides, known, frame, camera)
+        values = _values(item, overrides, known, frame, camera, bounds)
         count = len(item.vertices)
-        vertices.append(world_vertices_of(values[VERTICES], item, _pose(item.name, overrides, known, frame), frame))
+        pose = _pose(item.name, overrides, known, frame)
+        vertices.append(world_vertices_of(values[VERTICES], item, pose, frame))
         color = xp.broadcast_to(values[COLOR], (count, 3))
         if item.shade is not None:
             color = color * frame.array(item.shade)[:, None]
+        if scene.light is not None and item.normals is not None:
+            own = values[VERTICES] if f"{item.name}.{VERTICES.key}" in overrides else None
+            normals = world_normals_of(item, own, pose, frame)
+            points = frame.kind.to_numpy(vertices[-1])
+            color = color * frame.array(scene.light.factor(normals, points, eye))[:, None]
         opacity = xp.broadcast_to(values[OPACITY], (count,))
         rgba.append(xp.concatenate([color, opacity[:, None]], 1))
         if len(values[THICKNESS].shape) == 2:
@@ -190,8 +227,10 @@ def assemble(scene: Scene, parameters: Mapping[str, Any] | None = None, *, camer
         textures=textures,
         thickness_maps=thickness_maps,
         thickness_in_p=np.array([item.thickness_unit == "P" for item in scene.objects], dtype=bool),
+        camera=camera,
+        lens=lens,
         precision=frame.precision,
-        camera_pose=_pose(CAMERA, overrides, known, frame),
+        camera_pose=camera_pose,
     )
 
 
@@ -211,8 +250,30 @@ def world_vertices_of(own: Any, item: SceneObject, pose: tuple[Any, Any] | None,
     return frame.kind.xp.stack(points if pose is None else move_object(points, item.middle(), *pose), 1)
 
 
+def world_normals_of(item: SceneObject, own: Any, pose: tuple[Any, Any] | None, frame: Frame) -> np.ndarray:
+    """Return an object's normals in world space, of any length, (V, 3) float64 NumPy, without gradient.
+
+    Args:
+        item: the object, which has normals.
+        own: vertices in the place of its own, (V, 3); None for its own.
+        pose: its translation and rotation vector; None where it stays.
+        frame: the kind of all of them.
+    """
+    assert item.normals is not None
+    normals = item.normals
+    if own is not None:
+        normals = turned_normals(normals, item.faces, item.vertices, frame.kind.to_numpy(own))
+    normals = transformed_normals(normals, item.matrix)
+    return normals if pose is None else normals @ rotation_matrix(frame.kind.to_numpy(pose[1])).T
+
+
 def _values(
-    item: SceneObject, overrides: Mapping[str, Any], known: Mapping[str, Parameter], frame: Frame, camera: Camera
+    item: SceneObject,
+    overrides: Mapping[str, Any],
+    known: Mapping[str, Parameter],
+    frame: Frame,
+    camera: Camera,
+    bounds: Bounds,
 ) -> dict[Any, Any]:
     """Return an object's values by kind, checked: those given, or its own."""
     values = {}
@@ -222,7 +283,8 @@ def _values(
         if kind is THICKNESS:
             own = overrides.get(COMMON_THICKNESS.key, own)
         given = overrides.get(name, own)
-        values[kind] = frame.double(given) if kind is VERTICES else frame.array(given)
+        value = frame.double(given) if kind is VERTICES else frame.array(given)
+        values[kind] = known[name].bounded(value, bounds) if name in overrides else value
         known[name].check(values[kind], camera.shape)
     return values
 

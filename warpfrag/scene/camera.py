@@ -1,17 +1,24 @@
 """The camera: from scene units to pixels.
 
-Camera space has x to the right, y down and z forward (the planar depth), in scene units. Pixel (column, row) has its
-centre at +0.5, row 0 is the top one. A perspective camera looks along ((column + 0.5 − W/2)/f, (row + 0.5 − H/2)/f, 1)
-with f = (H/2)/tan(fov/2); an orthographic one along z from ((column + 0.5 − W/2), (row + 0.5 − H/2)) · height/H.
+Camera space has x to the right, y down and z forward (the planar depth), in scene units, as OpenCV's. Pixel
+(column, row) has its centre at +0.5, row 0 is the top one. With (cx, cy) the middle, the principal point or (W/2, H/2),
+a perspective camera looks along ((column + 0.5 − cx)/f, (row + 0.5 − cy)/f, 1) with f = (H/2)/tan(fov/2); an
+orthographic one along z from ((column + 0.5 − cx), (row + 0.5 − cy)) · height/H.
 """
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any, Literal, get_args
 
 import numpy as np
 
-from warpfrag.errors import check_number, is_whole, shorten
+from warpfrag.errors import check_choice, check_number, is_whole, shorten
 from warpfrag.scene.rotation import rotation_matrix
+
+# The axes of a camera's own space: x right, y down, z forward; or x right, y up, z back.
+Axes = Literal["opencv", "opengl"]
+# A matrix counts as a rotation, and pixels count as square, if they differ from that no more than files round.
+ROTATION_TOLERANCE, SQUARE_TOLERANCE = 1e-4, 1e-4
 
 
 @dataclass(frozen=True)
@@ -27,6 +34,7 @@ class Camera:
         near: planar depth of the near plane [scene units], above 0.
         far: planar depth of the far plane [scene units], beyond `near`.
         size: width and height of the image [pixels].
+        principal: where the line of sight meets the image, from its left and top edges [pixels]; None is its middle.
 
     Raises:
         ValueError: a value out of its range, both or neither of `fov` and `height`, eye at the target, up along the
@@ -45,14 +53,17 @@ class Camera:
     near: float = 0.01
     far: float = 100.0
     size: tuple[int, int] = (512, 512)
+    principal: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         for key in ("eye", "target", "up"):
-            object.__setattr__(self, key, _triple(key, getattr(self, key)))
+            object.__setattr__(self, key, _numbers(key, getattr(self, key), 3))
         for key in ("fov", "height", "near", "far"):
             value = getattr(self, key)
             object.__setattr__(self, key, None if value is None else check_number(f"camera.{key}", value))
         object.__setattr__(self, "size", _size(self.size))
+        if self.principal is not None:
+            object.__setattr__(self, "principal", _numbers("principal", self.principal, 2))
         if (self.fov is None) == (self.height is None):
             found = "neither" if self.fov is None else "both"
             raise ValueError(
@@ -75,6 +86,87 @@ class Camera:
             raise ValueError(
                 f"camera.up: got {list(self.up)}, expected a direction that is not along the line of sight"
             )
+
+    @classmethod
+    def look_at(cls, eye: Any, target: Any, up: Any = (0.0, 1.0, 0.0), **options: Any) -> "Camera":
+        """Return a camera at a point that looks at another; `options` are the other attributes."""
+        return cls(tuple(eye), tuple(target), tuple(up), **options)
+
+    @classmethod
+    def from_matrix(cls, matrix: Any, *, axes: Axes = "opencv", **options: Any) -> "Camera":
+        """Return the camera that a matrix puts into the world.
+
+        Args:
+            matrix: from camera space to world space (column vectors), (4, 4): a rotation and the eye's position.
+            axes: those of its camera space: "opencv", x right, y down, z forward; or "opengl", x right, y up, z back.
+            options: the other attributes: `fov` or `height`, `near`, `far`, `size`, `principal`.
+
+        Raises:
+            TypeError: a value of the wrong kind.
+            ValueError: a matrix that is no rigid motion, or a value out of its range.
+
+        Example:
+            >>> Camera.from_matrix(np.eye(4), fov=60.0).target
+            (0.0, 0.0, 1.0)
+        """
+        check_choice("axes", axes, get_args(Axes))
+        given = _matrix("matrix", matrix, (4, 4))
+        if not np.array_equal(given[3], [0.0, 0.0, 0.0, 1.0]):
+            raise ValueError(f"matrix: got {given[3].tolist()} in its last row, expected 0, 0, 0, 1")
+        turn, eye = _rotation("matrix", given[:3, :3]), given[:3, 3]
+        down, forward = (turn[:, 1], turn[:, 2]) if axes == "opencv" else (-turn[:, 1], -turn[:, 2])
+        # As far away as the eye from the origin, so that the difference keeps its digits.
+        target = eye + max(1.0, float(np.linalg.norm(eye))) * forward
+        return cls(tuple(eye.tolist()), tuple(target.tolist()), tuple((-down).tolist()), **options)
+
+    @classmethod
+    def from_intrinsics(
+        cls, intrinsics: Any, rotation: Any, translation: Any, size: tuple[int, int], **options: Any
+    ) -> "Camera":
+        """Return a camera of a calibration or a data set: K, R and t in OpenCV's convention.
+
+        A world point x projects to K (R x + t), with x right, y down, z forward, and whole numbers of pixels at the
+        corners of pixels (for values that mean their centres add 0.5 to the principal point).
+
+        Args:
+            intrinsics: K, (3, 3): focal length [pixels], the same along x and y, principal point anywhere, no skew.
+            rotation: R, from world space to camera space, (3, 3).
+            translation: t [scene units], (3,).
+            size: width and height of the image [pixels].
+            options: `near` and `far`.
+
+        Raises:
+            TypeError: a value of the wrong kind.
+            ValueError: a K with skew or pixels that are not square, an R that is no rotation, a value out of its range.
+        """
+        k = _matrix("intrinsics", intrinsics, (3, 3))
+        turn = _rotation("rotation", _matrix("rotation", rotation, (3, 3)))
+        shift = _matrix("translation", np.reshape(translation, -1), (3,))
+        fx, fy = float(k[0, 0]), float(k[1, 1])
+        if not (fx > 0.0 and fy > 0.0 and np.array_equal(k[2], [0.0, 0.0, 1.0]) and k[1, 0] == 0.0):
+            raise ValueError(f"intrinsics: got {shorten(k.tolist())}, expected focal lengths above 0, last row 0 0 1")
+        if abs(k[0, 1]) > SQUARE_TOLERANCE * fx or abs(fx / fy - 1.0) > SQUARE_TOLERANCE:
+            got = f"focal lengths {fx:g} and {fy:g} and skew {k[0, 1]:g}"
+            raise ValueError(f"intrinsics: got {got}, expected square pixels without skew (resample the image)")
+        width, height = _size(size)
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = turn.T, -turn.T @ shift
+        fov = 2.0 * math.degrees(math.atan2(0.5 * height, 0.5 * (fx + fy)))
+        principal = (float(k[0, 2]), float(k[1, 2]))
+        return cls.from_matrix(matrix, fov=fov, size=(width, height), principal=principal, **options)
+
+    def intrinsics(self) -> np.ndarray:
+        """Return K of a perspective camera, (3, 3) float64; see `from_intrinsics`.
+
+        Raises:
+            ValueError: the camera is orthographic.
+        """
+        return np.array([[self.focal, 0.0, self.middle[0]], [0.0, self.focal, self.middle[1]], [0.0, 0.0, 1.0]])
+
+    @property
+    def middle(self) -> tuple[float, float]:
+        """Where the line of sight meets the image, from its left and top edges [pixels]."""
+        return self.principal or (0.5 * self.size[0], 0.5 * self.size[1])
 
     @property
     def width(self) -> int:
@@ -125,7 +217,11 @@ class Camera:
 
     def resized(self, size: tuple[int, int]) -> "Camera":
         """Return this camera with another image size (width, height); the vertical field of view stays."""
-        return replace(self, size=size)
+        principal = self.principal
+        if principal is not None:
+            width, height = _size(size)
+            principal = principal[0] * width / self.size[0], principal[1] * height / self.size[1]
+        return replace(self, size=size, principal=principal)
 
     def moved(self, translation: np.ndarray, rotation: np.ndarray) -> "Camera":
         """Return this camera moved along its own axes (right, down, forward) and then turned about its eye.
@@ -147,11 +243,27 @@ def _unit(vector: np.ndarray) -> np.ndarray:
     return vector / np.linalg.norm(vector)
 
 
-def _triple(key: str, value: object) -> tuple[float, float, float]:
-    if isinstance(value, (list, tuple, np.ndarray)) and len(value) == 3:
-        x, y, z = (check_number(f"camera.{key}", part) for part in value)
-        return x, y, z
-    raise ValueError(f"camera.{key}: got {shorten(value)}, expected 3 numbers")
+def _numbers(key: str, value: object, count: int) -> tuple[float, ...]:
+    if isinstance(value, (list, tuple, np.ndarray)) and len(value) == count:
+        return tuple(check_number(f"camera.{key}", part) for part in value)
+    raise ValueError(f"camera.{key}: got {shorten(value)}, expected {count} numbers")
+
+
+def _matrix(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    try:
+        matrix = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise TypeError(f"{name}: got {shorten(value)}, expected numbers of shape {shape}") from None
+    if matrix.shape != shape or not np.isfinite(matrix).all():
+        raise ValueError(f"{name}: got shape {matrix.shape}, expected finite numbers of shape {shape}")
+    return matrix
+
+
+def _rotation(name: str, matrix: np.ndarray) -> np.ndarray:
+    """Return a matrix (3, 3) that is a rotation up to rounding."""
+    if np.abs(matrix @ matrix.T - np.eye(3)).max() > ROTATION_TOLERANCE or np.linalg.det(matrix) < 0.0:
+        raise ValueError(f"{name}: got a matrix that is no rotation, expected orthonormal axes, right-handed")
+    return matrix
 
 
 def _size(value: object) -> tuple[int, int]:

@@ -14,9 +14,12 @@ import numpy as np
 
 from warpfrag.arrays.kinds import NUMPY, kind_of
 from warpfrag.colors import parse_hex
-from warpfrag.errors import range_wording, shorten, suggest
+from warpfrag.errors import is_number, range_wording, shorten, suggest
 from warpfrag.scene.names import CAMERA, ThicknessUnit
 
+# What becomes of a value outside its range: it is put on the end of the range, or refused.
+Bounds = Literal["clamp", "error"]
+BOUNDS: tuple[Bounds, ...] = get_args(Bounds)
 Per = Literal["object", "vertex", "pixel", "view"]
 PER: tuple[Per, ...] = get_args(Per)
 Shape = tuple[int, ...]
@@ -53,7 +56,9 @@ class ParameterKind:
         unit: size of one unit of a fit's coordinate (the logarithm's is 1).
         bounds: between which it is fitted unless told otherwise; None for anywhere.
         is_length: whether `unit` and `bounds` are shares of the scene's extent.
+        shown: where its value is read, if not in that field.
         moves: what the parameter moves, and with it depths and coverage.
+        in_jacobian: whether least squares has a column for it where it is few values.
         look: which of an object's `LOOK_COUNT` numbers it is; None for none of them.
         parse: reads a value from a text; None from one that is no value.
         text: what such a text looks like.
@@ -70,7 +75,9 @@ class ParameterKind:
     unit: float = 1.0
     bounds: tuple[float, float] | None = None
     is_length: bool = False
+    shown: str | None = None
     moves: Literal["surfaces", "camera"] | None = None
+    in_jacobian: bool = True
     look: slice | None = None
     parse: Callable[[str], Any] = lambda text: None
     text: str = "numbers"
@@ -78,6 +85,11 @@ class ParameterKind:
     def __reduce__(self) -> Any:
         # There is one of each: a copy is the kind itself.
         return _find_kind, (self.owner, self.key)
+
+    @property
+    def is_bounded(self) -> bool:
+        """Whether some numbers are out of its range."""
+        return self.low > -math.inf or self.high < math.inf
 
     @property
     def range_wording(self) -> str:
@@ -138,7 +150,7 @@ _SHARE["text"] = range_wording(0.0, 1.0)
 _THICKNESS: dict[str, Any] = {"key": "thickness", "low": 0.0, "logarithmic": True, "is_length": True}
 _THICKNESS |= {"bounds": (SMALLEST_THICKNESS, LARGEST_THICKNESS), "look": slice(4, 5), "parse": parse_thickness}
 _THICKNESS["text"] = 'a number, or multiples of P(z) such as "2P"'
-_VECTOR: dict[str, Any] = {"value_shape": (3,), "parse": _numbers(3), "text": '"x,y,z"'}
+_VECTOR: dict[str, Any] = {"value_shape": (3,), "parse": _numbers(3), "text": "x,y,z"}
 _TRANSLATION = {**_VECTOR, "key": "translation", "unit": VERTEX_UNIT, "is_length": True}
 _ROTATION = {**_VECTOR, "key": "rotation", "unit": math.degrees(1.0)}
 
@@ -158,12 +170,26 @@ TRANSLATION = ParameterKind(owner="object", per=("object",), moves="surfaces", *
 ROTATION = ParameterKind(owner="object", per=("object",), moves="surfaces", **_ROTATION)
 CAMERA_TRANSLATION = ParameterKind(owner="camera", per=("object", "view"), moves="camera", **_TRANSLATION)
 CAMERA_ROTATION = ParameterKind(owner="camera", per=("object", "view"), moves="camera", **_ROTATION)
+_LENS: dict[str, Any] = {"owner": "camera", "per": ("object", "view"), "moves": "camera", "in_jacobian": False}
+# Of a perspective camera, of an orthographic one, and of both.
+FOV = ParameterKind(
+    "fov", field="fov", low=0.01, high=179.99, unit=math.degrees(1.0), bounds=(1.0, 175.0), parse=_numbers(1),
+    text="a number of degrees", **_LENS,
+)  # fmt: skip
+HEIGHT = ParameterKind(
+    "height", field="height", low=1e-30, logarithmic=True, bounds=(1e-3, 10.0), is_length=True, parse=_numbers(1),
+    text=range_wording(above=0.0), **_LENS,
+)  # fmt: skip
+PRINCIPAL = ParameterKind(
+    "principal", value_shape=(2,), field="principal", shown="middle", unit=10.0, parse=_numbers(2), text="x,y", **_LENS
+)
 
 SCENE_KINDS = (BETA, COMMON_THICKNESS)
 OBJECT_KINDS = (THICKNESS, COLOR, OPACITY, VERTICES)
 OBJECT_MOTIONS = (TRANSLATION, ROTATION)
-CAMERA_KINDS = (CAMERA_TRANSLATION, CAMERA_ROTATION)
-KINDS = (*SCENE_KINDS, *OBJECT_KINDS, *OBJECT_MOTIONS, *CAMERA_KINDS)
+CAMERA_MOTIONS = (CAMERA_TRANSLATION, CAMERA_ROTATION)
+LENS_KINDS = (FOV, HEIGHT, PRINCIPAL)
+KINDS = (*SCENE_KINDS, *OBJECT_KINDS, *OBJECT_MOTIONS, *CAMERA_MOTIONS, *LENS_KINDS)
 
 
 def kind_named(name: str) -> ParameterKind:
@@ -182,6 +208,15 @@ class HasVertices(Protocol):
 
     name: str
     vertices: np.ndarray
+
+
+class HasLens(Protocol):
+    """A camera as far as it has parameters."""
+
+    @property
+    def is_perspective(self) -> bool:
+        """Whether it has an opening angle."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,6 +253,16 @@ class Parameter:
         }
         return {per: shapes[per] for per in self.kind.per}
 
+    def bounded(self, value: Any, bounds: Bounds) -> Any:
+        """Return a value, clamped to its range if that is what `bounds` says; see `Kind.clip` for its gradient.
+
+        Infinities stay what they are, to be refused.
+        """
+        kind = kind_of(value) or NUMPY
+        if bounds != "clamp" or not self.kind.is_bounded or not bool(kind.xp.isfinite(kind.detach(value)).all()):
+            return value
+        return kind.clip(value, self.kind.low, self.kind.high)
+
     def check(self, value: Any, grid: Shape | None = None) -> None:
         """Check shape, range and finiteness of a value.
 
@@ -247,8 +292,15 @@ class Parameter:
             raise ValueError(f"{self.name}: got {found:.9g}, expected {self.kind.range_wording}")
 
 
-def describe(objects: Iterable[HasVertices]) -> dict[str, Parameter]:
-    """Return the parameters of a scene of some objects by name, in the order in which they are listed."""
+def bounded_beta(beta: Any, bounds: Bounds) -> Any:
+    """Return a beta, a number or an array, clamped to its range if that is what `bounds` says."""
+    if kind_of(beta) is not None:
+        return Parameter(BETA.key, BETA).bounded(beta, bounds)
+    return min(max(float(beta), BETA.low), BETA.high) if bounds == "clamp" and is_number(beta) else beta
+
+
+def describe(objects: Iterable[HasVertices], camera: HasLens) -> dict[str, Parameter]:
+    """Return the parameters of a scene of some objects and a camera by name, in the order in which they are listed."""
     objects = list(objects)
     found = [Parameter(kind.key, kind) for kind in SCENE_KINDS]
     for kinds in (OBJECT_KINDS, OBJECT_MOTIONS):
@@ -263,7 +315,8 @@ def describe(objects: Iterable[HasVertices]) -> dict[str, Parameter]:
             for item in objects
             for kind in kinds
         ]
-    found += [Parameter(f"{CAMERA}.{kind.key}", kind, CAMERA) for kind in CAMERA_KINDS]
+    lens = (FOV if camera.is_perspective else HEIGHT, PRINCIPAL)
+    found += [Parameter(f"{CAMERA}.{kind.key}", kind, CAMERA) for kind in (*CAMERA_MOTIONS, *lens)]
     return {parameter.name: parameter for parameter in found}
 
 

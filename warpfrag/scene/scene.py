@@ -10,8 +10,9 @@ import numpy as np
 from warpfrag.arrays.kinds import kind_of
 from warpfrag.errors import check_choice, check_number, check_whole, shorten
 from warpfrag.scene.camera import Camera
+from warpfrag.scene.light import Light, turned_normals
 from warpfrag.scene.names import CAMERA, MERGES, MIXES, POSE_KEYS, Merge, Mix
-from warpfrag.scene.parameters import BETA, COMMON_THICKNESS, Parameter, Thickness, check_name, describe
+from warpfrag.scene.parameters import BETA, COMMON_THICKNESS, VERTICES, Parameter, Thickness, check_name, describe
 from warpfrag.scene.surface import SceneObject
 
 
@@ -27,6 +28,7 @@ class Scene:
         layers: largest number of layers of a pixel, from 1.
         merge: how overlapping fragments merge.
         mix: how their colours are weighted.
+        light: what falls on objects that have normals; None leaves all unlit.
 
     Raises:
         TypeError: a value of the wrong kind.
@@ -40,6 +42,7 @@ class Scene:
     layers: int = 8
     merge: Merge = "smooth"
     mix: Mix = "opacity"
+    light: Light | None = None
 
     def __post_init__(self) -> None:
         self.objects = list(self.objects)
@@ -58,6 +61,8 @@ class Scene:
         self.layers = check_whole("layers", self.layers, 1)
         check_choice("merge", self.merge, MERGES)
         check_choice("mix", self.mix, MIXES)
+        if self.light is not None and not isinstance(self.light, Light):
+            raise TypeError(f"light: got {shorten(self.light)}, expected a Light or None")
 
     def __repr__(self) -> str:
         names = ", ".join(item.name for item in self.objects[:8]) + ", …" * (len(self.objects) > 8)
@@ -66,7 +71,7 @@ class Scene:
 
     def described(self) -> dict[str, Parameter]:
         """Return what is known of each parameter that `parameters=` takes, by name."""
-        return describe(self.objects)
+        return describe(self.objects, self.camera)
 
     def parameters(self) -> dict[str, float | np.ndarray]:
         """Return what can be overridden, fitted or differentiated, by name.
@@ -133,7 +138,7 @@ class Scene:
                     own.setdefault(owner, {}).update(_fields(parameter, value))
         objects = []
         for item in self.objects:
-            changed = replace(item, **own[item.name]) if item.name in own else item
+            changed = _changed(item, own[item.name]) if item.name in own else item
             # An object turns about the middle of what stands in this scene, whatever its vertices become.
             if item.name in moves:
                 changed = changed.moved(*_pose(moves[item.name]), pivot=item.middle())
@@ -186,7 +191,7 @@ class Scene:
         if kind.field is None:
             return np.zeros(kind.value_shape, dtype=np.float32)
         owners: dict[str, Any] = {"": self, CAMERA: self.camera, **{item.name: item for item in self.objects}}
-        value = getattr(owners[parameter.owner], kind.field)
+        value = getattr(owners[parameter.owner], kind.shown or kind.field)
         if np.ndim(value) == 0:
             return float(value)
         return np.array(value, dtype=np.float64 if getattr(value, "dtype", None) == np.float64 else np.float32)
@@ -214,6 +219,14 @@ def plain_value(parameter: Parameter, value: Any) -> Any:
     if isinstance(value, Thickness):
         return value
     return float(array) if array.ndim == 0 else array
+
+
+def _changed(item: SceneObject, fields: Mapping[str, Any]) -> SceneObject:
+    """Return an object with other values, its normals turned as its surface is."""
+    if item.normals is None or VERTICES.key not in fields:
+        return replace(item, **fields)
+    normals = turned_normals(item.normals, item.faces, item.vertices, fields[VERTICES.key])
+    return replace(item, normals=normals, **fields)
 
 
 def _fields(parameter: Parameter, value: Any) -> dict[str, Any]:

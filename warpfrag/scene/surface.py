@@ -17,7 +17,7 @@ class SceneObject:
     """One named surface: triangles, their place, and how they look.
 
     Arrays may be given as anything NumPy can read; they are kept as the types below. What the image uses as colour is
-    `color · shade · texture colour`, as opacity `opacity · texture alpha`.
+    `color · shade · light · texture colour`, as opacity `opacity · texture alpha`.
 
     Attributes:
         name: unique in its scene.
@@ -34,6 +34,8 @@ class SceneObject:
         texture: straight linear RGBA image (h, w, 4) float32, row 0 at the top, or a list of them; None without.
         texture_index: which image each face takes from a list, (N,) int32, −1 for none; None where all take the first.
         shade: baked factor per vertex (V,), multiplied into the colour; None for 1.
+        normals: in the object's own space, of any length, (V, 3) float64, on which the scene's light falls; None is
+            unlit.
 
     Raises:
         TypeError: a name that is no text.
@@ -52,6 +54,7 @@ class SceneObject:
     texture: np.ndarray | list[np.ndarray] | None = None
     texture_index: np.ndarray | None = None
     shade: np.ndarray | None = None
+    normals: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str):
@@ -80,6 +83,11 @@ class SceneObject:
             self.shade = self._array("shade", self.shade).astype(np.float32)
             expected = f"shape ({len(self.vertices)},)"
             self._fail_unless(self.shade.shape == (len(self.vertices),), "shade", f"shape {self.shade.shape}", expected)
+        if self.normals is not None:
+            self.normals = self._array("normals", self.normals).astype(np.float64)
+            shaped = self.normals.shape == (len(self.vertices), 3) and bool(np.isfinite(self.normals).all())
+            expected = f"finite numbers of shape ({len(self.vertices)}, 3)"
+            self._fail_unless(shaped, "normals", f"shape {self.normals.shape}", expected)
 
     def __repr__(self) -> str:
         return f"SceneObject({self.name!r}, {len(self.vertices)} vertices, {len(self.faces)} faces)"

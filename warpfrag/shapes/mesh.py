@@ -5,6 +5,8 @@ from typing import Any
 
 import numpy as np
 
+from warpfrag.scene.light import area_vectors, transformed_normals, unit_rows
+
 # Of what says nothing about its colour, in linear light.
 GREY = 0.8
 
@@ -35,11 +37,6 @@ class Mesh:
     textures: list[np.ndarray] = field(default_factory=list)
     texture_index: np.ndarray | None = None
     name: str = ""
-
-
-def named(mesh: Mesh, name: str) -> Mesh:
-    """Return a mesh under a name."""
-    return replace(mesh, name=name)
 
 
 def placed(mesh: Mesh, matrix: np.ndarray) -> Mesh:
@@ -133,7 +130,7 @@ def unshared(mesh: Mesh) -> Mesh:
 
 def split_faces(mesh: Mesh) -> Mesh:
     """Give every face three vertices of its own (face-major), with flat normals."""
-    normals = np.repeat(_unit_rows(_area_vectors(mesh.vertices, mesh.faces)), 3, axis=0)
+    normals = np.repeat(unit_rows(area_vectors(mesh.vertices, mesh.faces)), 3, axis=0)
     return replace(unshared(mesh), normals=normals)
 
 
@@ -160,7 +157,7 @@ def smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
         (V, 3) float64 unit normals; zero for a vertex that no face of positive area uses.
     """
     points, corners = weld(np.asarray(vertices, dtype=np.float64), faces)
-    area = _area_vectors(points, corners)
+    area = area_vectors(points, corners)
     total = np.zeros_like(points)
     for corner in range(3):
         here, ahead, behind = (points[corners[:, (corner + step) % 3]] for step in range(3))
@@ -178,39 +175,5 @@ def smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     face, corner_of = np.nonzero(uses_lost)
     total[corners[face, corner_of]] = area[face]
     normals = np.zeros((len(vertices), 3))
-    normals[faces.reshape(-1)] = _unit_rows(total)[corners.reshape(-1)]
+    normals[faces.reshape(-1)] = unit_rows(total)[corners.reshape(-1)]
     return normals
-
-
-def transformed_normals(normals: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """Carry normals (V, 3) through the linear part of `matrix`; of any length, NaN-free for singular matrices."""
-    # The cofactor matrix is the inverse transpose up to a factor, and exists for every matrix.
-    a, b, c = np.asarray(matrix, dtype=np.float64)[:3, :3]
-    return normals @ np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)]).T
-
-
-def lambert(normals: np.ndarray, towards_light: np.ndarray, ambient: float) -> np.ndarray:
-    """Return the two-sided Lambert factor `ambient + (1 − ambient)·|n·l|` of each vertex, (V,) float32.
-
-    Args:
-        normals: (V, 3) world-space normals of any length; a zero normal is lit by the ambient part alone.
-        towards_light: world direction towards the light, (3,) or one per vertex (V, 3), any length.
-        ambient: share of the light that comes from everywhere, 0…1.
-    """
-    normals, light = _unit_rows(normals), _unit_rows(np.broadcast_to(towards_light, normals.shape))
-    facing = np.minimum(np.abs(np.einsum("ij,ij->i", normals, light)), 1.0)
-    return (ambient + (1.0 - ambient) * facing).astype(np.float32)
-
-
-def _area_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    first, second, third = (vertices[faces[:, corner]].astype(np.float64) for corner in range(3))
-    return np.cross(second - first, third - first)
-
-
-def _unit_rows(vectors: np.ndarray) -> np.ndarray:
-    vectors = np.asarray(vectors, dtype=np.float64)
-    largest = np.abs(vectors).max(axis=1, keepdims=True, initial=0.0)
-    # Tiny meshes have areas whose square underflows: scale by the largest component first.
-    scaled = vectors / np.where(largest > 0.0, largest, 1.0)
-    length = np.linalg.norm(scaled, axis=1, keepdims=True)
-    return scaled / np.where(length > 0.0, length, 1.0)

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 import warpfrag as wf
-from warpfrag.shapes.mesh import Mesh, lambert
+from warpfrag.scene.light import lambert
+from warpfrag.shapes.mesh import Mesh
 from warpfrag.shapes.surfels import surfels
 
 HERE = Path(__file__).parent

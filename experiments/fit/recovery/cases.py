@@ -8,7 +8,8 @@ import numpy as np
 
 import warpfrag as wf
 from warpfrag.fit.views import View
-from warpfrag.shapes.mesh import Mesh, lambert, smooth_normals
+from warpfrag.scene.light import lambert
+from warpfrag.shapes.mesh import Mesh, smooth_normals
 from warpfrag.shapes.primitives import sphere
 from warpfrag.shapes.surfels import PointSet, surfels
 

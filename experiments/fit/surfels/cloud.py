@@ -9,9 +9,10 @@ import warpfrag as wf
 from warpfrag.colors import linear_to_srgb
 from warpfrag.files.meshes import load_mesh
 from warpfrag.scene.camera import Camera
+from warpfrag.scene.light import lambert
 from warpfrag.scene.scene import Scene
 from warpfrag.scene.surface import SceneObject
-from warpfrag.shapes.mesh import Mesh, lambert, smooth_normals
+from warpfrag.shapes.mesh import Mesh, smooth_normals
 from warpfrag.shapes.surfels import PointSet
 
 # Times that the mesh's edges are halved: colours between vertices are then close to `paint`.
