@@ -132,7 +132,8 @@ class Setting:
         self.thinnest, self.thickest = (share * case.depth for share in THICKNESSES)
         self.residual_count = 4 * size * size * len(self.views)
         study = self.study(dict.fromkeys(self.names, 0.5), [np.zeros((size, size, 4), np.float32)] * len(self.views))
-        self.frozen = [FrozenView(study, view, index, study.device) for index, view in enumerate(study.prepared.views)]
+        prepared = study.prepared
+        self.frozen = [FrozenView(prepared, view, index, study.device) for index, view in enumerate(prepared.views)]
 
     def draw(self, generator: np.random.Generator) -> dict[str, float]:
         """Draw parameter values."""
@@ -164,7 +165,7 @@ class Setting:
     def problem(self, study: Study) -> Problem:
         """Return a study's problem, with what has been captured already."""
         problem = Problem(study)
-        problem.views = [FrozenView(study, view.view, view.index, view.device) for view in problem.views]
+        problem.views = [FrozenView(problem.study, view.view, view.index, view.device) for view in problem.views]
         for view, frozen in zip(problem.views, self.frozen, strict=True):
             view.coverage, view.unit = frozen.coverage, frozen.unit
         return problem
