@@ -27,6 +27,8 @@ class Fragment(NamedTuple):
     depth: float
     thickness: float
     opacity_sum: float
+    opaque_count: float = 1
+    """How many opaque fragments it was mixed of, if it is opaque."""
 
     @property
     def front(self) -> float:
@@ -45,6 +47,7 @@ class Piece(NamedTuple):
     color: np.ndarray
     opacity: float
     opacity_sum: float
+    opaque_count: float = 1
 
     weight = Fragment.weight
 
@@ -94,6 +97,7 @@ def over(first: Piece, second: Piece) -> Piece:
         first.color + transmittance * second.color,
         first.opacity + transmittance * second.opacity,
         first.opacity_sum + second.opacity_sum,
+        first.opaque_count if first.opacity.real == 1.0 else second.opaque_count,
     )
 
 
@@ -113,14 +117,15 @@ def mix_pieces(first: Piece, second: Piece, mix: str = "opacity") -> Piece:
         color = mix_by_optical_depth(first, second)
     else:
         raise ValueError(f"mix is {mix!r}, expected 'opacity', 'average' or 'optical_depth'")
-    return Piece(color, opacity, opacity_sum)
+    count = sum(piece.opaque_count for piece in (first, second) if piece.opacity.real == 1.0)
+    return Piece(color, opacity, opacity_sum, count or 1)
 
 
 def mix_by_optical_depth(first: Piece, second: Piece) -> np.ndarray:
-    """Colour of two pieces weighted by optical depth; where any is opaque, the mean of the opaque ones."""
-    opaque = [piece.color for piece in (first, second) if piece.opacity.real == 1.0]
+    """Colour of two pieces weighted by optical depth; where any is opaque, the mean of all opaque fragments in them."""
+    opaque = [piece for piece in (first, second) if piece.opacity.real == 1.0]
     if opaque:
-        return sum(opaque) / len(opaque)
+        return sum(piece.color * piece.opaque_count for piece in opaque) / sum(piece.opaque_count for piece in opaque)
     first_ratio = depth_per_opacity(first.opacity)
     second_ratio = depth_per_opacity(second.opacity)
     optical_depth = first.opacity * first_ratio + second.opacity * second_ratio
@@ -160,7 +165,7 @@ def part(fragment: Fragment, r0: float, r1: float, beta: float, mix: str = "opac
     A_01 = (A(r1) - A(r0)) / (1 - A(r0)), and colour and opacity sum in proportion to it.
     """
     if r0 == 0.0 and r1 == 1.0:
-        return Piece(fragment.color, fragment.opacity, fragment.opacity_sum)
+        return whole(fragment)
     if r0 == r1:
         return NOTHING
     share = part_share(fragment, r0, r1, beta, mix)
@@ -170,7 +175,12 @@ def part(fragment: Fragment, r0: float, r1: float, beta: float, mix: str = "opac
         passed = transmittance_to(fragment, r0, beta, mix)
         if passed.real > 0.0:
             opacity = 1.0 - transmittance_to(fragment, r1, beta, mix) / passed
-    return Piece(fragment.color * share, opacity, fragment.opacity_sum * share)
+    return Piece(fragment.color * share, opacity, fragment.opacity_sum * share, fragment.opaque_count)
+
+
+def whole(fragment: Fragment) -> Piece:
+    """A fragment as a piece."""
+    return Piece(fragment.color, fragment.opacity, fragment.opacity_sum, fragment.opaque_count)
 
 
 def part_share(fragment: Fragment, r0: float, r1: float, beta: float, mix: str) -> float:
@@ -227,15 +237,16 @@ def sfm(first: Fragment, second: Fragment, beta: float, mix: str = "opacity") ->
     )
     rest = part_between(second, first.depth, second.depth, beta, mix)
     merged = over(part_between(opening, front, middle, beta, mix), over(shared, rest))
-    return Fragment(merged.color, merged.opacity, second.depth, second.depth - front, merged.opacity_sum)
+    thickness = second.depth - front
+    return Fragment(merged.color, merged.opacity, second.depth, thickness, merged.opacity_sum, merged.opaque_count)
 
 
 def ofm(a: Fragment, b: Fragment, mix: str = "opacity") -> Fragment:
     """Merge two fragments without regard to their order."""
-    mixed = mix_pieces(Piece(a.color, a.opacity, a.opacity_sum), Piece(b.color, b.opacity, b.opacity_sum), mix)
+    mixed = mix_pieces(whole(a), whole(b), mix)
     depth = max(a.depth, b.depth, key=lambda depth: depth.real)
     front = min(a.front, b.front, key=lambda depth: depth.real)
-    return Fragment(mixed.color, mixed.opacity, depth, depth - front, mixed.opacity_sum)
+    return Fragment(mixed.color, mixed.opacity, depth, depth - front, mixed.opacity_sum, mixed.opaque_count)
 
 
 # Section 7: the resolve pass.
@@ -243,12 +254,9 @@ def ofm(a: Fragment, b: Fragment, mix: str = "opacity") -> Fragment:
 
 def tail(running: Fragment, successor: Fragment) -> Fragment:
     """Take a fragment that does not overlap into the last layer, by over."""
-    both = over(
-        Piece(running.color, running.opacity, running.opacity_sum),
-        Piece(successor.color, successor.opacity, successor.opacity_sum),
-    )
+    both = over(whole(running), whole(successor))
     thickness = successor.depth - running.depth + running.thickness
-    return Fragment(both.color, both.opacity, successor.depth, thickness, both.opacity_sum)
+    return Fragment(both.color, both.opacity, successor.depth, thickness, both.opacity_sum, both.opaque_count)
 
 
 def sort_fragments(fragments: list[Fragment]) -> list[Fragment]:
@@ -347,7 +355,7 @@ def resolve(
         layers = resolve_pixel(fragments, betas[pixel], max_layers, merge, mix)
         count[pixel] = len(layers)
         for slot, layer in enumerate(layers):
-            dense[pixel, slot] = (*layer.color, *layer[1:])
+            dense[pixel, slot] = (*layer.color, *layer[1:5])
     return Layers(dense[..., :4], dense[..., 4], dense[..., 5], dense[..., 6], count)
 
 

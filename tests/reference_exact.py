@@ -138,7 +138,7 @@ def resolve_exactly(
         layers = resolve_pixel_exactly(pixel_fragments(rows[own]), betas[own].tolist(), max_layers, mix)
         count[pixel] = len(layers)
         for slot, layer in enumerate(layers):
-            dense[pixel, slot] = (*layer.color, *layer[1:])
+            dense[pixel, slot] = (*layer.color, *layer[1:5])
     return Layers(dense[..., :4], dense[..., 4], dense[..., 5], dense[..., 6], count)
 
 
@@ -167,7 +167,7 @@ def exact_gradient(
             return np.sum(image_cotangent[pixel] * composite_pixel(layers))
         total = 0.0
         for slot, layer in enumerate(layers):
-            values = (np.append(layer.color, layer.opacity), *layer[2:])
+            values = (np.append(layer.color, layer.opacity), *layer[2:5])
             for cotangent, value in zip(cotangents, values, strict=True):
                 total = total + np.sum(cotangent[pixel, slot] * value)
         return total

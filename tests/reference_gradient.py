@@ -34,7 +34,7 @@ def resolve_gradient(
     def objective(pixel: int, layers: list[Fragment]) -> float:
         total = 0.0
         for slot, layer in enumerate(layers):
-            values = (np.append(layer.color, layer.opacity), *layer[2:])
+            values = (np.append(layer.color, layer.opacity), *layer[2:5])
             for cotangent, value in zip(dense, values, strict=True):
                 if cotangent is not None:
                     total = total + np.sum(cotangent[pixel, slot] * value)

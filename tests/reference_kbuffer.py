@@ -54,7 +54,7 @@ def kbuffer(rgba, depth, thickness, offsets, opacity_sum=None, slots: int = 8, *
         layers = kbuffer_pixel(fragments, slots, **options)
         count[pixel] = len(layers)
         for slot, layer in enumerate(layers):
-            dense[pixel, slot] = (*layer.color, *layer[1:])
+            dense[pixel, slot] = (*layer.color, *layer[1:5])
     return Layers(dense[..., :4], dense[..., 4], dense[..., 5], dense[..., 6], count)
 
 
@@ -73,7 +73,7 @@ def kbuffer_gradient(rgba, depth, thickness, offsets, opacity_sum=None, *, cotan
             perturbed = rows[own].astype(np.complex128)
             perturbed[index] += 1j * step
             for slot, layer in enumerate(kbuffer_pixel(pixel_fragments(perturbed), slots, **options)):
-                values = (np.append(layer.color, layer.opacity), *layer[2:])
+                values = (np.append(layer.color, layer.opacity), *layer[2:5])
                 for cotangent, value in zip(cotangents, values, strict=True):
                     gradients[own][index] += np.imag(np.sum(cotangent[pixel, slot] * value)) / step
     return gradients

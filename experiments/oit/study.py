@@ -26,7 +26,6 @@ import study_scenes as scenes  # noqa: E402
 from methods import BETA, COMPARED, OTHERS, SLOTS, over_background  # noqa: E402
 
 import warpfrag as wf  # noqa: E402
-from warpfrag.capture.bounded import capture_kbuffer  # noqa: E402
 from warpfrag.capture.surfaces import place_surfaces  # noqa: E402
 from warpfrag.files.saving import replacing  # noqa: E402
 from warpfrag.raster.ray import Window  # noqa: E402
@@ -269,7 +268,7 @@ def _passes(scene: wf.Scene, repetitions: int) -> dict[str, Any]:
             times[way] = {"count": count, "store": store, "resolve": resolve}
         del fragments
         for way, merge in (("SKB", "none"), ("SKB+OFM", "order_independent")):
-            store, layers = _timed(lambda m=merge: capture_kbuffer(scene, slots=SLOTS, merge=m))
+            store, layers = _timed(lambda m=merge: wf.storage.capture_kbuffer(scene, slots=SLOTS, merge=m))
             resolve, _ = _timed(lambda l=layers: wf.composite(l))  # noqa: E741
             times[way] = {"store": max(store - place, 0.0), "resolve": resolve}
             del layers

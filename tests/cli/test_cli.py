@@ -108,6 +108,8 @@ MISTAKES = [
     (["render", "scene.toml", "-o", "a.png", "--thickness", "-1"], "thickness: "),
     (["render", "scene.toml", "-o", "a.png", "--background", "red"], '--background: got "red"'),
     (["render", "scene.toml", "-o", "a.png", "--set", "beta"], "expected NAME=VALUE"),
+    (["render", "scene.toml", "-o", "a.png", "--set", "ball.vertices=1"], "expected a parameter that one line holds"),
+    (["render", "scene.toml", "-o", "a.png", "--thickness", "1e300"], "--thickness: got 1e300, expected a number"),
     (["render", "scene.toml", "-o", "a.png", "--set", "bal.opacity=1"], 'did you mean "ball.opacity"?'),
     (["render", "scene.toml", "-o", "a.png", "--set", "ball.opacity=2"], "ball.opacity: "),
     (["render", "scene.toml", "-o", "a.png", "--set", "ball.rotation=1,2"], "expected x,y,z"),

@@ -105,8 +105,10 @@ def test_layers_are_connected_runs_and_the_tail_takes_the_rest():
 
 
 def test_thickness_lost_in_rounding_is_none():
-    """In single precision a slab of 1e-9 at depth 1 is a surface, and nothing divides by its length."""
-    pixels = Pixels(np.array([[0.5, 0, 0, 0.5], [0, 0.5, 0, 0.5]]), np.ones(2), np.array([1e-9, 0.0]), np.array([0, 2]))
+    """A slab of 1e-16 at depth 1 is a surface, and nothing divides by its length."""
+    pixels = Pixels(
+        np.array([[0.5, 0, 0, 0.5], [0, 0.5, 0, 0.5]]), np.ones(2), np.array([1e-16, 0.0]), np.array([0, 2])
+    )
     fragments = fragments_of(pixels, "float32")
     layers = wf.resolve(fragments, merge="exact")
     assert layers.count == 1

@@ -152,6 +152,8 @@ def _split(setting: str, scene: "Scene") -> tuple[str, str]:
         if setting.strip().startswith(name) and rest.startswith("="):
             return name, rest[1:].strip()
     name = setting.partition("=")[0].strip()
+    if name in scene.parameter_names():
+        raise UsageError(f"--set: got {shorten(name)}, expected a parameter that one line holds")
     raise UsageError(f"--set: got the unknown name {shorten(name)}; {suggest(name, known)}")
 
 
@@ -162,9 +164,11 @@ def _numbers(option: str, text: str, counts: Sequence[int], expected: str) -> li
         numbers = [float(part) for part in text.split(",")]
     except ValueError:
         numbers = []
-    if len(numbers) not in counts or any(abs(number) > LARGEST for number in numbers):
-        raise UsageError(f"{option}: got {_shown(text)}, expected {expected}")
-    return numbers
+    if len(numbers) in counts and any(abs(number) > LARGEST for number in numbers):
+        expected = f"{expected}, of at most {LARGEST:.3g}"
+    elif len(numbers) in counts:
+        return numbers
+    raise UsageError(f"{option}: got {_shown(text)}, expected {expected}")
 
 
 def _shown(text: str) -> str:

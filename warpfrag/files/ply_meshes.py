@@ -39,7 +39,7 @@ def read_ply_mesh(source: Source) -> tuple[list[Mesh], str]:
     for name in file.elements:
         if name == "edge":
             source.note("edges are not drawn")
-    mesh = Mesh(points, faces.astype(np.int32), scalar_columns(vertex, ("nx", "ny", "nz")))
+    mesh = Mesh(points, faces.astype(np.int32, copy=False), scalar_columns(vertex, ("nx", "ny", "nz")))
     if mesh.normals is not None and not np.isfinite(mesh.normals).all():
         mesh = replace(mesh, normals=None)
     for names in _COORDINATES:
@@ -56,7 +56,9 @@ def _faces(file: PlyFile, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
     lists = next((face.lists[name] for name in _INDICES if name in face.lists), None) if face else None
     if lists is not None and len(lists.values):
         polygon, places = cut_polygons(points, lists.counts, lists.values)
-        return polygon, places, lists.values.astype(np.int64)[places]
+        # Triangles are what they are; taking each of their corners anew would be most of the time.
+        faces = lists.values.reshape(-1, 3) if (lists.counts == 3).all() else lists.values[places]
+        return polygon, places, faces
     strips = file.elements.get("tristrips")
     found = next((strips.lists[name] for name in _INDICES if name in strips.lists), None) if strips else None
     if found is None:

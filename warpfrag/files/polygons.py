@@ -21,12 +21,13 @@ def cut_polygons(points: np.ndarray, counts: np.ndarray, corners: np.ndarray) ->
     Raises:
         ValueError: a corner names a point that is not there.
     """
-    counts, corners = np.asarray(counts, dtype=np.int64), np.asarray(corners, dtype=np.int64)
+    counts = np.asarray(counts, dtype=np.int64)
     if len(corners) and not (corners.min() >= 0 and corners.max() < len(points)):
         wrong = corners.min() if corners.min() < 0 else corners.max()
         raise ValueError(f"a face names vertex {wrong}, there are {len(points)}")
     if (counts == 3).all():
         return np.arange(len(counts)), np.arange(3 * len(counts)).reshape(-1, 3)
+    corners = np.asarray(corners, dtype=np.int64)
     first = np.cumsum(counts) - counts
     polygon, places = _fans(counts, first)
     if counts.max() <= 3:

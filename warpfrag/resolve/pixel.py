@@ -41,10 +41,10 @@ def precedes(lists: Any, i: int, depth: Any, at: int, j: int):
     other_depth = lists.depth[j]
     if depth != other_depth:
         return depth < other_depth
-    front_i = depth - lists.thickness[i]
-    front_j = other_depth - lists.thickness[j]
-    if front_i != front_j:
-        return front_i < front_j
+    thickness_i = lists.thickness[i]
+    thickness_j = lists.thickness[j]
+    if thickness_i != thickness_j:
+        return thickness_i > thickness_j
     return i < j
 
 

@@ -105,7 +105,7 @@ def put_layer(out: Any, seen: Any, layer: Any, opacity_sum: Any, pixel: int, num
     out.rgba[pixel, number] = wp.vector(color[0], color[1], color[2], layer.opacity)
     if out.depth.shape[0] > 0:
         out.depth[pixel, number] = layer.back
-        out.thickness[pixel, number] = layer.back - layer.front
+        out.thickness[pixel, number] = layer.thickness
         out.opacity_sum[pixel, number] = opacity_sum
     return seen
 
@@ -126,12 +126,12 @@ def finish_layers(out: Any, seen: Any, pixel: int, count: int, most: int):
 
 @wp.func(inline=True)
 def layer_cotangent(grads: Any, behind: Any, layer: Any, through: Any, pixel: int, number: int):
-    """Return the gradient in a layer, whose thickness is back - front and opacity sum A w."""
+    """Return the gradient in a layer, whose opacity sum is A w."""
     zero = type(through)(0.0)
     color = wp.vector(zero, zero, zero)
     opacity = zero
     weight = zero
-    front = zero
+    thickness = zero
     back = zero
     if grads.rgba.shape[0] > 0:
         rgba = grads.rgba[pixel, number]
@@ -140,12 +140,11 @@ def layer_cotangent(grads: Any, behind: Any, layer: Any, through: Any, pixel: in
     if grads.depth.shape[0] > 0:
         back = grads.depth[pixel, number]
     if grads.thickness.shape[0] > 0:
-        back = back + grads.thickness[pixel, number]
-        front = -grads.thickness[pixel, number]
+        thickness = grads.thickness[pixel, number]
     if grads.opacity_sum.shape[0] > 0:
         opacity = opacity + grads.opacity_sum[pixel, number] * layer.weight
         weight = grads.opacity_sum[pixel, number] * layer.opacity
-    return type(layer)(color, opacity, zero, zero, weight, front, back), behind
+    return type(layer)(color, opacity, zero, zero, weight, thickness, back), behind
 
 
 IMAGE = Sink("image", ImageArrays, put_in_image, finish_image, image_cotangent, ("image",))

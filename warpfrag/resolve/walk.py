@@ -80,6 +80,7 @@ def resolve_fwd(number: Any, merge: int, mix: int, sink: Sink) -> Any:
             begin = lists.offsets[pixel]
             count = lists.offsets[pixel + 1] - begin
             beta = pixel_beta(lists, pixel)
+            wants_log = merge == MERGE_SMOOTH or mix == MIX_OPTICAL_DEPTH
             if not valid_beta(beta):
                 wp.atomic_min(invalid, span.worker, 1, pixel)
             sort_pixel(lists, begin, count, order, base)
@@ -91,7 +92,7 @@ def resolve_fwd(number: Any, merge: int, mix: int, sink: Sink) -> Any:
                 fragment = order[base + position]
                 if not valid_fragment(lists, fragment):
                     wp.atomic_min(invalid, span.worker, 0, fragment)
-                following = load_slab(lists, fragment, running, merge == MERGE_SMOOTH)
+                following = load_slab(lists, fragment, running, wants_log)
                 step = int(STEP_START)
                 if position > 0:
                     step = choose_step(running, following, layer, lists.max_layers, merge)
@@ -117,12 +118,13 @@ def replay(lists: Any, pixel: int, merge: int, mix: int, scratch: Any, base: int
     begin = lists.offsets[pixel]
     count = lists.offsets[pixel + 1] - begin
     beta = pixel_beta(lists, pixel)
+    wants_log = merge == MERGE_SMOOTH or mix == MIX_OPTICAL_DEPTH
     sort_pixel(lists, begin, count, scratch.order, base)
     layer = int(0)
     through = type(beta)(1.0)
     running = type(scratch.running[base])()
     for position in range(count):
-        following = load_slab(lists, scratch.order[base + position], running, merge == MERGE_SMOOTH)
+        following = load_slab(lists, scratch.order[base + position], running, wants_log)
         step = int(STEP_START)
         if position > 0:
             step = choose_step(running, following, layer, lists.max_layers, merge)

@@ -10,7 +10,7 @@ from warpfrag.arrays.kinds import as_vectors
 from warpfrag.arrays.launch import Span, launch
 from warpfrag.arrays.operator import Input
 from warpfrag.arrays.precisions import Array, Number, Vector4, in_precisions
-from warpfrag.slabs.slab import NEGLIGIBLE, WEIGHT_LIMIT, divide, log_transmittance
+from warpfrag.slabs.slab import THIN, THINNEST, WEIGHT_LIMIT, divide, log_transmittance
 
 wp.set_module_options({"enable_backward": False})
 
@@ -68,18 +68,18 @@ def load_slab(lists: Any, fragment: int, slab: Any, wants_log: bool):
     if wants_log:
         log_t = log_transmittance(opacity)
     back = lists.depth[fragment]
-    front = front_of(lists, fragment)
-    return type(slab)(wp.vector(rgba[0], rgba[1], rgba[2]), opacity, one - opacity, log_t, weight, front, back)
+    thickness = thickness_of(lists, fragment)
+    return type(slab)(wp.vector(rgba[0], rgba[1], rgba[2]), opacity, one - opacity, log_t, weight, thickness, back)
 
 
 @wp.func(inline=True)
-def front_of(lists: Any, fragment: int):
-    """Return the front of a fragment; a slab too thin to be divided is a surface: its front is its back."""
-    back = lists.depth[fragment]
-    front = back - lists.thickness[fragment]
-    if back - front < type(back)(NEGLIGIBLE):
-        front = back
-    return front
+def thickness_of(lists: Any, fragment: int):
+    """Return the thickness of a fragment; that of a slab too thin to be divided is 0: it is a surface."""
+    thickness = lists.thickness[fragment]
+    least = wp.max(type(thickness)(THIN) * wp.abs(lists.depth[fragment]), type(thickness)(THINNEST))
+    if thickness < least:
+        thickness = type(thickness)(0.0)
+    return thickness
 
 
 @wp.func(inline=True)
@@ -102,9 +102,9 @@ def store_gradient(g: Any, lists: Any, fragment: int, grads: Any):
     if grads.rgba.shape[0] > 0:
         grads.rgba[fragment] = wp.vector(g.color[0], g.color[1], g.color[2], g_opacity)
     if grads.depth.shape[0] > 0:
-        grads.depth[fragment] = g.back + g.front
+        grads.depth[fragment] = g.back
     if grads.thickness.shape[0] > 0:
-        grads.thickness[fragment] = -g.front
+        grads.thickness[fragment] = g.thickness
 
 
 @wp.func(inline=True)

@@ -13,9 +13,16 @@ from typing import Any
 
 import warp as wp
 
-from warpfrag.slabs.mix import MIX_AVERAGE, average_adjoint, light_to_parts, mixed_shares, weighted_adjoint
-from warpfrag.slabs.part import optical_gain_adjoint, optical_gains, relative_lengths
-from warpfrag.slabs.slab import WEIGHT_LIMIT, divide, per_length
+from warpfrag.slabs.mix import (
+    MIX_AVERAGE,
+    MIX_OPTICAL_DEPTH,
+    average_adjoint,
+    light_to_parts,
+    mixed_shares,
+    weighted_adjoint,
+)
+from warpfrag.slabs.part import optical_gain_adjoint, optical_gains, relative_lengths, relative_lengths_adjoint
+from warpfrag.slabs.slab import NEGLIGIBLE, WEIGHT_LIMIT, begins_first, divide
 
 wp.set_module_options({"enable_backward": False})
 
@@ -37,11 +44,28 @@ def merge(a: Any, b: Any, x: Any, y: Any, v: Any, mix: int):
         share_a * a.color + share_b * b.color,
         opacity,
         a.transmittance * b.transmittance,
-        a.log_transmittance + b.log_transmittance,
+        merged_log(a, b, x, y, v, mix),
         wp.min(weight, type(x)(WEIGHT_LIMIT)),
-        wp.min(a.front, b.front),
-        wp.max(a.back, b.back),
+        wp.max(a.thickness + (b.back - a.back), b.thickness),
+        b.back,
     )
+
+
+@wp.func(inline=True)
+def merged_log(a: Any, b: Any, x: Any, y: Any, v: Any, mix: int):
+    """Return the logarithm of the transmittance; where that is none it counts those that are seen, `opaque_count`."""
+    log_t = a.log_transmittance + b.log_transmittance
+    if mix == MIX_OPTICAL_DEPTH:
+        d_a, d_1, d_2 = light_to_parts(a, b, x, y, v)
+        a_alone = d_a <= type(x)(NEGLIGIBLE)
+        b_alone = d_1 <= type(x)(NEGLIGIBLE)
+        mixed_opaque_a = a.transmittance <= d_a * type(x)(NEGLIGIBLE)
+        mixed_opaque_b = d_2 <= d_1 * type(x)(NEGLIGIBLE)
+        if a_alone or (mixed_opaque_a and not mixed_opaque_b):
+            log_t = a.log_transmittance
+        elif b_alone or (mixed_opaque_b and not mixed_opaque_a):
+            log_t = b.log_transmittance
+    return log_t
 
 
 @wp.func(inline=True)
@@ -102,15 +126,11 @@ def merge_adjoint(g: Any, a: Any, b: Any, x: Any, y: Any, v: Any, mix: int):
     mixed_a, mixed_b = mixed_shares(a, b, x, y, v, mix)
     share_a = one - x + mixed_a
     share_b = one - y - v + mixed_b + a.transmittance * v
-    a_first = a.front <= b.front
-    a_last = a.back > b.back
+    # t = max(t_a + z_b - z_a, t_b),  z = z_b.
     log_t = g.log_transmittance
-    g_a = type(a)(
-        share_a * g.color, g_aa, g_at, log_t, g_aw, wp.where(a_first, g.front, zero), wp.where(a_last, g.back, zero)
-    )
-    g_b = type(a)(
-        share_b * g.color, g_ba, g_bt, log_t, g_bw, wp.where(a_first, zero, g.front), wp.where(a_last, zero, g.back)
-    )
+    g_ta = wp.where(begins_first(a, b), g.thickness, zero)
+    g_a = type(a)(share_a * g.color, g_aa, g_at, log_t, g_aw, g_ta, -g_ta)
+    g_b = type(a)(share_b * g.color, g_ba, g_bt, log_t, g_bw, g.thickness - g_ta, g.back + g_ta)
     return g_a, g_b, g_x, g_y, g_v
 
 
@@ -151,7 +171,7 @@ def sfm_adjoint(g: Any, a: Any, b: Any, beta: Any, mix: int, floor: Any, through
     )
     g_beta = g_x * (a1 - x) + g_y * (b1 - y) + g_v * (b2 - v)
     # The gains are differences of the gain up to a cut, which is constant at the ends of a slab.
-    a_first = a.front < b.front
+    a_first = begins_first(a, b)
     g_front = -optical * wp.where(a_first, g_x, g_y)
     g_back = optical * (g_y - g_v)
     first_opacity = wp.where(a_first, a.opacity, b.opacity)
@@ -162,24 +182,15 @@ def sfm_adjoint(g: Any, a: Any, b: Any, beta: Any, mix: int, floor: Any, through
     back_opacity, back_log_t, g_r1 = optical_gain_adjoint(
         g_back, b.opacity, b.log_transmittance, one - b2, through_back, floor
     )
-    # Lengths: a0 and b0 reach from the first front to the inner one, a1 and b1 from there to a.back, b2 on to b.back.
-    per_a = wp.where(a_first, per_length(a), zero)
-    per_b = per_length(b)
-    g_a1 = beta * g_x
-    g_b1 = beta * g_y
-    g_b2 = beta * g_v - g_r1
-    g_length_a = -(g_r0 * a0 + g_a1 * a1) * per_a
-    g_length_b = -(g_r0 * b0 + g_b1 * b1 + g_b2 * b2) * per_b
-    g_outer = -g_r0 * wp.where(a_first, per_a, per_b)
-    g_inner = -g_outer - g_a1 * per_a - g_b1 * per_b
+    g_ta, g_tb, g_between = relative_lengths_adjoint(g_r0, beta * g_x, beta * g_y, beta * g_v - g_r1, a, b)
     more_a = type(a)(
         g_a.color,
         g_a.opacity + wp.where(a_first, front_opacity, zero),
         g_a.transmittance,
         g_a.log_transmittance + wp.where(a_first, front_log_t, zero),
         g_a.weight,
-        g_a.front + wp.where(a_first, g_outer, g_inner) - g_length_a,
-        g_a.back + g_a1 * per_a + g_length_a + (g_b1 - g_b2) * per_b,
+        g_a.thickness + g_ta,
+        g_a.back - g_between,
     )
     more_b = type(a)(
         g_b.color,
@@ -187,7 +198,7 @@ def sfm_adjoint(g: Any, a: Any, b: Any, beta: Any, mix: int, floor: Any, through
         g_b.transmittance,
         g_b.log_transmittance + wp.where(a_first, zero, front_log_t) + back_log_t,
         g_b.weight,
-        g_b.front + wp.where(a_first, g_inner, g_outer) - g_length_b,
-        g_b.back + g_b2 * per_b + g_length_b,
+        g_b.thickness + g_tb,
+        g_b.back + g_between,
     )
     return more_a, more_b, g_beta

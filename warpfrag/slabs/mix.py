@@ -16,7 +16,7 @@ from typing import Any
 
 import warp as wp
 
-from warpfrag.slabs.slab import NEGLIGIBLE, SERIES_OPACITY, divide
+from warpfrag.slabs.slab import LOG_OPAQUE, NEGLIGIBLE, SERIES_OPACITY, divide
 
 wp.set_module_options({"enable_backward": False})
 
@@ -55,20 +55,27 @@ def light_to_parts(a: Any, b: Any, x: Any, y: Any, v: Any):
 
 
 @wp.func(inline=True)
+def opaque_count(s: Any):
+    """Return how many opaque fragments an opaque slab was mixed of: their logarithms of no transmittance add."""
+    return wp.max(s.log_transmittance / type(s.opacity)(LOG_OPAQUE), type(s.opacity)(1.0))
+
+
+@wp.func(inline=True)
 def mix_weights(a: Any, b: Any, x: Any, y: Any, v: Any, mix: int):
     """Return the weights of the two colours of a mix, and whether opaque parts fixed them (then they add up to 1)."""
     zero = type(x)(0.0)
     one = type(x)(1.0)
-    half = type(x)(0.5)
     if mix == MIX_OPTICAL_DEPTH:
         d_a, d_1, d_2 = light_to_parts(a, b, x, y, v)
         t_a = divide(a.transmittance, d_a, zero)
         t_b = divide(d_2, d_1, zero)
-        # Opaque parts win; two of them are averaged.
+        # Opaque parts win; of two of them the mean is taken, each as many times as there are opaque fragments in it.
         opaque_a = t_a <= type(x)(NEGLIGIBLE)
         opaque_b = t_b <= type(x)(NEGLIGIBLE)
         if opaque_a and opaque_b:
-            return half, half, True
+            count_a = opaque_count(a)
+            share = count_a / (count_a + opaque_count(b))
+            return share, one - share, True
         if opaque_a:
             return one, zero, True
         if opaque_b:

@@ -13,7 +13,7 @@ from typing import Any
 
 import warp as wp
 
-from warpfrag.slabs.slab import LOG_OPAQUE, SERIES_OPACITY, per_length
+from warpfrag.slabs.slab import LOG_OPAQUE, SERIES_OPACITY, begins_first
 
 wp.set_module_options({"enable_backward": False})
 
@@ -77,16 +77,51 @@ def optical_gain_adjoint(g: Any, opacity: Any, log_t: Any, r: Any, power: Any, f
 
 @wp.func(inline=True)
 def relative_lengths(a: Any, b: Any):
-    """Return the lengths of the pieces relative to their slabs, a = [a0 | a1], b = [b0 | b1 | b2]; a0 = 0 or b0 = 0."""
-    inner = wp.max(a.front, b.front)
-    per_b = per_length(b)
-    a0 = type(inner)(0.0)
-    a1 = type(inner)(1.0)
-    if a.front < b.front:
-        per_a = per_length(a)
-        a0 = (inner - a.front) * per_a
-        a1 = (a.back - inner) * per_a
-    return a0, a1, (inner - b.front) * per_b, (a.back - inner) * per_b, (b.back - a.back) * per_b
+    """Return the lengths of the pieces relative to their slabs, a = [a0 | a1], b = [b0 | b1 | b2]; a0 = 0 or b0 = 0.
+
+    With e = t_b - (z_b - z_a), how far a reaches into b: a0 = (t_a - e)/t_a, a1 = e/t_a, b1 = e/t_b where a begins
+    first, else b0 = (e - t_a)/t_b, b1 = t_a/t_b; b2 = (z_b - z_a)/t_b.
+    """
+    one = type(a.back)(1.0)
+    between = b.back - a.back
+    into = b.thickness - between
+    per_b = one / b.thickness
+    a0 = type(a.back)(0.0)
+    a1 = type(a.back)(1.0)
+    b0 = type(a.back)(0.0)
+    b1 = into * per_b
+    if begins_first(a, b):
+        per_a = one / a.thickness
+        a0 = (a.thickness - into) * per_a
+        a1 = into * per_a
+    else:
+        b0 = (into - a.thickness) * per_b
+        b1 = a.thickness * per_b
+    return a0, a1, b0, b1, between * per_b
+
+
+@wp.func(inline=True)
+def relative_lengths_adjoint(g_first: Any, g_a1: Any, g_b1: Any, g_b2: Any, a: Any, b: Any):
+    """Return the gradients in the thicknesses of a and b and in z_b - z_a of `relative_lengths`.
+
+    `g_first` is the gradient in the length of the piece that is in front, a0 or b0. That of each quotient goes to its
+    numerator, and minus the quotient times as much to its denominator.
+    """
+    one = type(a.back)(1.0)
+    a0, a1, b0, b1, b2 = relative_lengths(a, b)
+    per_b = one / b.thickness
+    g_between = g_b2 * per_b
+    if begins_first(a, b):
+        per_a = one / a.thickness
+        # a0 = (t_a - into)/t_a, a1 = into/t_a, b1 = into/t_b
+        g_into = (g_a1 - g_first) * per_a + g_b1 * per_b
+        g_ta = g_first * per_a - (g_first * a0 + g_a1 * a1) * per_a
+        g_tb = g_into - (g_b1 * b1 + g_b2 * b2) * per_b
+        return g_ta, g_tb, g_between - g_into
+    # b0 = (into - t_a)/t_b, b1 = t_a/t_b; a1 = 1
+    g_into = g_first * per_b
+    g_tb = g_into - (g_first * b0 + g_b1 * b1 + g_b2 * b2) * per_b
+    return (g_b1 - g_first) * per_b, g_tb, g_between - g_into
 
 
 @wp.func(inline=True)
@@ -110,7 +145,7 @@ def optical_gains(a: Any, b: Any, through_front: Any, through_back: Any):
     """Return the gains x, y, v of two overlapping slabs, a.back <= b.back, for beta = 0, given their `sfm_powers`."""
     one = type(through_front)(1.0)
     a0, a1, b0, b1, b2 = relative_lengths(a, b)
-    a_first = a.front < b.front
+    a_first = begins_first(a, b)
     return (
         optical_gain(a.opacity, a0, one, wp.where(a_first, through_front, one), a.transmittance),
         optical_gain(b.opacity, b0, one - b2, wp.where(a_first, one, through_front), through_back),

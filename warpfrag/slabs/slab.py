@@ -25,6 +25,10 @@ SERIES_OPACITY = wp.constant(0.02)
 # What lets less than this through is opaque, and nothing is divided by less: in single precision derivatives of such
 # quotients would overflow.
 NEGLIGIBLE = wp.constant(1.0e-24)
+# A slab thinner than this, in units of its depth, is a surface: it could not be told from one. So is one whose length
+# has no reciprocal in single precision.
+THIN = wp.constant(1.0e-15)
+THINNEST = wp.constant(1.0e-36)
 # The weight of a slab can triple whenever it is divided (all three parts of an opaque slab are opaque). Above this
 # limit no other slab has a say in a mix: there it stays, with no derivative, before it overflows.
 WEIGHT_LIMIT = wp.constant(1.0e12)
@@ -35,8 +39,9 @@ class Slab:
     """A slab, or the gradient in one.
 
     `color` is premultiplied; `transmittance` is 1 - `opacity`, `log_transmittance` its logarithm; `weight` is S/A, the
-    opacity sum per opacity: 1 for a fresh fragment; it reaches from the depth `front` to `back`. Adjoints take opacity,
-    transmittance and its logarithm as independent: the sum of the three is the derivative in opacity.
+    opacity sum per opacity: 1 for a fresh fragment; it reaches from the depth back - `thickness` to `back`. Fronts are
+    never formed: their differences would have lost the digits of thin slabs far away, those of backs have not. Adjoints
+    take opacity, transmittance and its logarithm as independent: the sum of the three is the derivative in opacity.
     """
 
     color: Vector3
@@ -44,7 +49,7 @@ class Slab:
     transmittance: Number
     log_transmittance: Number
     weight: Number
-    front: Number
+    thickness: Number
     back: Number
 
 
@@ -68,10 +73,11 @@ def divide(numerator: Any, denominator: Any, limit: Any):
 @wp.func(inline=True)
 def overlap(a: Any, b: Any):
     """Tell whether two slabs overlap; slabs that only touch do not."""
-    return a.back > b.front and b.back > a.front
+    between = b.back - a.back
+    return b.thickness > between and a.thickness > -between
 
 
 @wp.func(inline=True)
-def per_length(s: Any):
-    """Return 1 / thickness."""
-    return type(s.back)(1.0) / (s.back - s.front)
+def begins_first(a: Any, b: Any):
+    """Tell whether slab a begins in front of slab b; one that begins where the other does, does not."""
+    return a.thickness > b.thickness - (b.back - a.back)

@@ -25,7 +25,9 @@ def cut_slab(s: Any, depth: Any, beta: Any, floor: Any):
     zero = type(depth)(0.0)
     if depth >= s.back:
         return one, s.transmittance, zero
-    r = (depth - s.front) / (s.back - s.front)
+    r = (depth - s.back + s.thickness) / s.thickness
+    if r <= zero:
+        return zero, one, one
     exponent = wp.max(s.log_transmittance, floor)
     power = zero
     if exponent > type(depth)(LOG_OPAQUE):
@@ -35,12 +37,15 @@ def cut_slab(s: Any, depth: Any, beta: Any, floor: Any):
 
 @wp.func(inline=True)
 def cut_slab_adjoint(g: Any, s: Any, r: Any, power: Any, beta: Any, floor: Any):
-    """Return the gradients in A, log T, f, z, the depth and beta of <g, share behind the cut>; 0 < r < 1."""
+    """Return the gradients in A, log T, t, z, the depth and beta of <g, share behind the cut>.
+
+    r = (depth - z + t)/t: its derivative is 1/t in the depth, -1/t in z and (1 - r)/t in t.
+    """
     one = type(g)(1.0)
     g_opacity, g_log_t, g_r = optical_gain_adjoint(-(one - beta) * g, s.opacity, s.log_transmittance, r, power, floor)
-    g_depth = (g_r - beta * g) / (s.back - s.front)
+    g_depth = (g_r - beta * g) / s.thickness
     g_beta = g * (one - r - optical_rest(s, r, power))
-    return g_opacity, g_log_t, g_depth * (r - one), -g_depth * r, g_depth, g_beta
+    return g_opacity, g_log_t, g_depth * (one - r), -g_depth, g_depth, g_beta
 
 
 @wp.func(inline=True)

@@ -39,6 +39,7 @@ from warpfrag.resolve.exact.sweep import (
     in_progress,
     leave,
     load_pixel,
+    nearest_depth,
 )
 from warpfrag.resolve.options import MERGE_INPUTS, MergeOptions, merge_inputs, sum_beta
 from warpfrag.resolve.pixel import valid_beta
@@ -100,7 +101,8 @@ def exact_fwd(number: Any, mix: int, beta_per: int, sink: Sink) -> Any:
         for pixel in range(span.begin + wp.tid(), span.end, span.stride):
             begin = lists.offsets[pixel]
             count = lists.offsets[pixel + 1] - begin
-            load_pixel(lists, begin, count, scratch, base)
+            nearest = nearest_depth(lists, begin, count)
+            load_pixel(lists, begin, count, nearest, scratch, base)
             for fragment in range(begin, begin + count):
                 if not valid_fragment(lists, fragment):
                     wp.atomic_min(invalid, span.worker, 0, fragment)
@@ -112,13 +114,14 @@ def exact_fwd(number: Any, mix: int, beta_per: int, sink: Sink) -> Any:
             running.transmittance = number(1.0)
             opacity_sum = number(0.0)
             through = number(1.0)
+            first = number(0.0)
             layer = int(-1)
             sweep = sweep_type()
             # At most two intervals a fragment, whatever is in the arrays.
             steps = int(0)
             while in_progress(sweep, count) and steps < 2 * count:
                 steps += 1
-                sweep = advance(sweep, scratch, base, count)
+                sweep = advance(sweep, scratch, base, count, layer < lists.max_layers - 1)
                 if sweep.fresh:
                     # In the tail a run goes on behind what its layer has already.
                     through = running.transmittance
@@ -128,7 +131,7 @@ def exact_fwd(number: Any, mix: int, beta_per: int, sink: Sink) -> Any:
                         layer += 1
                         running = slab()
                         running.transmittance = number(1.0)
-                        running.front = sweep.begin
+                        first = sweep.begin
                         opacity_sum = number(0.0)
                         through = number(1.0)
                 for position in range(sweep.entered, sweep.following):
@@ -138,7 +141,8 @@ def exact_fwd(number: Any, mix: int, beta_per: int, sink: Sink) -> Any:
                 running.color += through * part_color
                 through *= tau
                 opacity_sum += part_sum
-                running.back = sweep.end
+                running.back = nearest + sweep.end
+                running.thickness = sweep.end - first
                 sweep = leave(sweep, scratch, base)
             if layer >= 0:
                 seen = put(out, seen, running, opacity_sum, pixel, layer)
@@ -172,7 +176,7 @@ def show_intervals(sweep: Any, lists: Any, pixel: int, scratch: Any, base: int, 
     g = wp.vector(zero, zero, zero)
     steps = int(0)
     while in_progress(sweep, count) and steps < 2 * count:
-        sweep = advance(sweep, scratch, base, count)
+        sweep = advance(sweep, scratch, base, count, layer < lists.max_layers - 1)
         if sweep.fresh:
             through = clear
             if layer < lists.max_layers - 1:
@@ -253,7 +257,7 @@ def take_back(
     g_sum = type(zero)(0.0)
     for interval in range(interval_count):
         at = 2 * base + interval
-        sweep = advance(sweep, scratch, base, count)
+        sweep = advance(sweep, scratch, base, count, layer < lists.max_layers - 1)
         if scratch.layer[at] != layer:
             layer = scratch.layer[at]
             g = layer_gradient(grads, pixel, layer, zero)
@@ -303,7 +307,7 @@ def exact_bwd(number: Any, mix: int, beta_per: int) -> Any:
             begin = lists.offsets[pixel]
             count = lists.offsets[pixel + 1] - begin
             zero = number(0.0)
-            load_pixel(lists, begin, count, scratch, base)
+            load_pixel(lists, begin, count, nearest_depth(lists, begin, count), scratch, base)
             interval_count, last_layer = show_intervals(
                 sweep_type(), lists, pixel, scratch, base, grad_out, mix, beta_per
             )

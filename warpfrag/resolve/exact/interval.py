@@ -127,11 +127,14 @@ def cut_member(g: Any, sweep: Any, lists: Any, pixel: int, scratch: Any, base: i
 
 
 @wp.func(inline=True)
-def cut_adjoint(g_share: Any, g_opacity: Any, g_passed: Any, scratch: Any, at: int, beta: Any, floor: Any):
+def cut_adjoint(
+    g_share: Any, g_opacity: Any, g_passed: Any, was_active: bool, scratch: Any, at: int, beta: Any, floor: Any
+):
     """Take the gradients in a part's share, opacity (by its slab's) and transmittance to its slab and its cuts.
 
-    share = (rest - next_rest) / D, passed = D' / D with D, D' = T + A rest, T + A next_rest. The cut at the interval's
-    begin also ended the interval before: its gradient is complete, and goes on to the slab.
+    share = (rest - next_rest) / D, passed = D' / D with D, D' = T + A rest, T + A next_rest. The interval's begin is a
+    cut of slabs that were active before: it also ended their part in the interval before, its gradient is complete, and
+    goes on to the slab. Others begin there: nothing of them is in front.
 
     Returns:
         The gradient in the depth of the interval's begin.
@@ -152,17 +155,16 @@ def cut_adjoint(g_share: Any, g_opacity: Any, g_passed: Any, scratch: Any, at: i
     grad = scratch.grad[at]
     grad.opacity = grad.opacity + g_opacity * share + g_after * next_rest
     grad.transmittance = grad.transmittance + g_after
-    if rest < one:
+    if was_active:
         grad.opacity = grad.opacity + g_before * rest
         grad.transmittance = grad.transmittance + g_before
         g_rest += s.opacity * g_before
-    if scratch.cut[at] > zero:
-        cut_opacity, cut_log_t, cut_front, cut_back, cut_depth, cut_beta = cut_slab_adjoint(
+        cut_opacity, cut_log_t, cut_thickness, cut_back, cut_depth, cut_beta = cut_slab_adjoint(
             g_rest + scratch.grad_rest[at], s, scratch.cut[at], scratch.power[at], beta, floor
         )
         grad.opacity = grad.opacity + cut_opacity
         grad.log_transmittance = grad.log_transmittance + cut_log_t
-        grad.front = grad.front + cut_front
+        grad.thickness = grad.thickness + cut_thickness
         grad.back = grad.back + cut_back
         g_depth = cut_depth
         scratch.grad_beta[at] = scratch.grad_beta[at] + cut_beta
@@ -252,7 +254,8 @@ def blend_adjoint(
         scratch.grad[at] = grad
         g_share = projection * weight * scale + g_a * s.opacity
         beta = fragment_beta(lists, pixel, scratch.order[at], beta_per)
-        g_depth += cut_adjoint(g_share, g_a, g_passed, scratch, at, beta, lists.floor)
+        was_active = at - base < sweep.entered
+        g_depth += cut_adjoint(g_share, g_a, g_passed, was_active, scratch, at, beta, lists.floor)
         opacity_behind = a + passed * opacity_behind
         tau_behind *= passed
     move_boundary(g_depth, sweep.begin_boundary, scratch, base)
@@ -266,5 +269,6 @@ def move_boundary(g: Any, boundary: int, scratch: Any, base: int):
     if boundary % 2 == 1:
         grad.back = grad.back + g
     else:
-        grad.front = grad.front + g
+        grad.back = grad.back + g
+        grad.thickness = grad.thickness - g
     scratch.grad[at] = grad
