@@ -21,12 +21,17 @@ def levels(path):
     return np.asarray(Image.open(path)).astype(int)
 
 
+def differing(one, other):
+    """Share of the pixels of two image files that differ by more than 2 levels: on another machine outlines may."""
+    return np.mean(np.abs(levels(one) - levels(other)).max(axis=-1) > 2)
+
+
 @pytest.mark.parametrize("name", make_images.RENDERS)
 def test_renders_are_up_to_date(tmp_path, name, monkeypatch):
     """A picture is what its command renders, to the rounding of another machine; else run docs/make_images.py."""
     monkeypatch.chdir(ROOT)
     assert main([*make_images.RENDERS[name].split(), "-o", str(tmp_path / name)]) == 0
-    assert np.abs(levels(tmp_path / name) - levels(make_images.IMAGES / name)).max() <= 2
+    assert differing(tmp_path / name, make_images.IMAGES / name) < 1e-3
 
 
 def test_pictures_of_the_fit_are_up_to_date(tmp_path, monkeypatch):
@@ -39,7 +44,7 @@ def test_pictures_of_the_fit_are_up_to_date(tmp_path, monkeypatch):
     for name, given in values.items():
         words = [f"--set={key}={value}" for key, value in given.items()]
         assert main(["render", "scenes/bunny_in_sphere.toml", "-o", str(tmp_path / name), *words]) == 0
-        assert np.abs(levels(tmp_path / name) - levels(make_images.IMAGES / name)).max() <= 2
+        assert differing(tmp_path / name, make_images.IMAGES / name) < 1e-3
 
 
 def test_pictures_show_what_merging_and_beta_do():
