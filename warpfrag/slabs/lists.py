@@ -10,11 +10,13 @@ from warpfrag.arrays.kinds import as_vectors
 from warpfrag.arrays.launch import Span, launch
 from warpfrag.arrays.operator import Input
 from warpfrag.arrays.precisions import Array, Number, Vector4, in_precisions
-from warpfrag.slabs.slab import THIN, THINNEST, WEIGHT_LIMIT, divide, log_transmittance
+from warpfrag.slabs.slab import THIN, THINNEST, WEIGHT_LIMIT, divide, finite, finite_slab, log_transmittance
 
 wp.set_module_options({"enable_backward": False})
 
 NO_FRAGMENT = wp.constant(2147483647)
+# Colours, depths and thicknesses are below the largest number by this factor: what is summed of a pixel is finite too.
+HEADROOM = wp.constant(1024.0)
 
 # What operators on fragments take.
 FRAGMENT_INPUTS = (
@@ -83,8 +85,9 @@ def thickness_of(lists: Any, fragment: int):
 
 
 @wp.func(inline=True)
-def store_gradient(g: Any, lists: Any, fragment: int, grads: Any):
+def store_gradient(gradient: Any, lists: Any, fragment: int, grads: Any):
     """Write the gradient of a fragment, given that of the slab that `load_slab` made of it."""
+    g = finite_slab(gradient)
     opacity = lists.rgba[fragment][3]
     zero = type(opacity)(0.0)
     transmittance = type(opacity)(1.0) - opacity
@@ -95,12 +98,12 @@ def store_gradient(g: Any, lists: Any, fragment: int, grads: Any):
         # The weight is S/A, up to its limit.
         g_sum = zero
         if divide(lists.opacity_sum[fragment], opacity, zero) < type(opacity)(WEIGHT_LIMIT):
-            g_sum = divide(g.weight, opacity, zero)
+            g_sum = finite(divide(g.weight, opacity, zero))
             g_opacity -= divide(g_sum * lists.opacity_sum[fragment], opacity, zero)
         if grads.opacity_sum.shape[0] > 0:
             grads.opacity_sum[fragment] = g_sum
     if grads.rgba.shape[0] > 0:
-        grads.rgba[fragment] = wp.vector(g.color[0], g.color[1], g.color[2], g_opacity)
+        grads.rgba[fragment] = wp.vector(g.color[0], g.color[1], g.color[2], finite(g_opacity))
     if grads.depth.shape[0] > 0:
         grads.depth[fragment] = g.back
     if grads.thickness.shape[0] > 0:
@@ -113,8 +116,10 @@ def valid_fragment(lists: Any, fragment: int):
     rgba = lists.rgba[fragment]
     thickness = lists.thickness[fragment]
     zero = type(thickness)(0.0)
-    # Zero times everything: one NaN or infinity anywhere makes the sum NaN.
-    nothing = zero * rgba[0] + zero * rgba[1] + zero * rgba[2] + zero * (lists.depth[fragment] - thickness)
+    # Zero times everything: one NaN or infinity anywhere makes the sum NaN. And what is nearly infinite is as good as.
+    room = type(thickness)(HEADROOM)
+    nothing = zero * (room * rgba[0]) + zero * (room * rgba[1]) + zero * (room * rgba[2])
+    nothing += zero * (room * lists.depth[fragment]) + zero * (room * thickness)
     if lists.opacity_sum.shape[0] > 0:
         opacity_sum = lists.opacity_sum[fragment]
         nothing += zero * opacity_sum
@@ -214,9 +219,10 @@ def report_invalid(invalid: wp.array, inputs: SimpleNamespace, beta_per: str = "
             for each in FRAGMENT_INPUTS
             if each.gradient and getattr(inputs, each.name) is not None
         }
+        most = np.finfo(wp.dtype_to_numpy(inputs.depth.dtype)).max / HEADROOM
         raise ValueError(
             f"fragments: got {', '.join(f'{name} {value}' for name, value in values.items())} in fragment {fragment}, "
-            "expected finite values, opacity from 0 to 1, thickness and opacity_sum of at least 0"
+            f"expected finite values up to {most:.1e}, opacity from 0 to 1, thickness and opacity_sum of at least 0"
         )
     if pixel != NO_FRAGMENT:
         beta = inputs.beta.numpy()[min(pixel, inputs.beta.shape[0] - 1)]

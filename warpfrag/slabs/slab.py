@@ -32,6 +32,9 @@ THINNEST = wp.constant(1.0e-36)
 # The weight of a slab can triple whenever it is divided (all three parts of an opaque slab are opaque). Above this
 # limit no other slab has a say in a mix: there it stays, with no derivative, before it overflows.
 WEIGHT_LIMIT = wp.constant(1.0e12)
+# What a gradient counts as that is beyond the numbers of its precision, as those in thicknesses of 1e-36 or opacities of
+# 1e-24 may be: so large that sums of some, and their products with ordinary numbers, stay finite.
+LARGEST_GRADIENT = wp.constant(1.0e30)
 
 
 @in_precisions
@@ -81,3 +84,34 @@ def overlap(a: Any, b: Any):
 def begins_first(a: Any, b: Any):
     """Tell whether slab a begins in front of slab b; one that begins where the other does, does not."""
     return a.thickness > b.thickness - (b.back - a.back)
+
+
+@wp.func(inline=True)
+def finite(gradient: Any):
+    """Return a gradient; in place of an infinite one the largest, in place of one whose terms cancel there none."""
+    if wp.isfinite(gradient):
+        return gradient
+    if gradient > type(gradient)(0.0):
+        return type(gradient)(LARGEST_GRADIENT)
+    if gradient < type(gradient)(0.0):
+        return -type(gradient)(LARGEST_GRADIENT)
+    return type(gradient)(0.0)
+
+
+@wp.func(inline=True)
+def finite_slab(g: Any):
+    """Return the gradient in a slab with each of its numbers `finite`."""
+    total = g.color[0] + g.color[1] + g.color[2] + g.opacity + g.transmittance + g.log_transmittance
+    total += g.weight + g.thickness + g.back
+    if wp.isfinite(total):
+        # Nearly always: one infinity or NaN anywhere would show in the sum.
+        return g
+    return type(g)(
+        wp.vector(finite(g.color[0]), finite(g.color[1]), finite(g.color[2])),
+        finite(g.opacity),
+        finite(g.transmittance),
+        finite(g.log_transmittance),
+        finite(g.weight),
+        finite(g.thickness),
+        finite(g.back),
+    )
