@@ -10,7 +10,7 @@ from warpfrag.arrays.kinds import as_vectors
 from warpfrag.arrays.launch import Span, launch
 from warpfrag.arrays.operator import Input
 from warpfrag.arrays.precisions import Array, Number, Vector4, in_precisions
-from warpfrag.slabs.slab import THIN, THINNEST, WEIGHT_LIMIT, divide, finite, finite_slab, log_transmittance
+from warpfrag.slabs.slab import THIN, THINNEST, WEIGHT_LIMIT, divide, finite, log_transmittance
 
 wp.set_module_options({"enable_backward": False})
 
@@ -85,9 +85,8 @@ def thickness_of(lists: Any, fragment: int):
 
 
 @wp.func(inline=True)
-def store_gradient(gradient: Any, lists: Any, fragment: int, grads: Any):
-    """Write the gradient of a fragment, given that of the slab that `load_slab` made of it."""
-    g = finite_slab(gradient)
+def store_gradient(g: Any, lists: Any, fragment: int, grads: Any):
+    """Write the gradient of a fragment, `finite`, given that of the slab that `load_slab` made of it."""
     opacity = lists.rgba[fragment][3]
     zero = type(opacity)(0.0)
     transmittance = type(opacity)(1.0) - opacity
@@ -98,16 +97,17 @@ def store_gradient(gradient: Any, lists: Any, fragment: int, grads: Any):
         # The weight is S/A, up to its limit.
         g_sum = zero
         if divide(lists.opacity_sum[fragment], opacity, zero) < type(opacity)(WEIGHT_LIMIT):
-            g_sum = finite(divide(g.weight, opacity, zero))
+            g_sum = divide(g.weight, opacity, zero)
             g_opacity -= divide(g_sum * lists.opacity_sum[fragment], opacity, zero)
         if grads.opacity_sum.shape[0] > 0:
-            grads.opacity_sum[fragment] = g_sum
+            grads.opacity_sum[fragment] = finite(g_sum)
     if grads.rgba.shape[0] > 0:
-        grads.rgba[fragment] = wp.vector(g.color[0], g.color[1], g.color[2], finite(g_opacity))
+        color = wp.vector(finite(g.color[0]), finite(g.color[1]), finite(g.color[2]))
+        grads.rgba[fragment] = wp.vector(color[0], color[1], color[2], finite(g_opacity))
     if grads.depth.shape[0] > 0:
-        grads.depth[fragment] = g.back
+        grads.depth[fragment] = finite(g.back)
     if grads.thickness.shape[0] > 0:
-        grads.thickness[fragment] = g.thickness
+        grads.thickness[fragment] = finite(g.thickness)
 
 
 @wp.func(inline=True)

@@ -32,7 +32,7 @@ THINNEST = wp.constant(1.0e-36)
 # The weight of a slab can triple whenever it is divided (all three parts of an opaque slab are opaque). Above this
 # limit no other slab has a say in a mix: there it stays, with no derivative, before it overflows.
 WEIGHT_LIMIT = wp.constant(1.0e12)
-# What a gradient counts as that is beyond the numbers of its precision, as those in thicknesses of 1e-36 or opacities of
+# What a gradient counts as that is beyond the numbers of its precision, as one in a thickness of 1e-36 or an opacity of
 # 1e-24 may be: so large that sums of some, and their products with ordinary numbers, stay finite.
 LARGEST_GRADIENT = wp.constant(1.0e30)
 
@@ -96,22 +96,3 @@ def finite(gradient: Any):
     if gradient < type(gradient)(0.0):
         return -type(gradient)(LARGEST_GRADIENT)
     return type(gradient)(0.0)
-
-
-@wp.func(inline=True)
-def finite_slab(g: Any):
-    """Return the gradient in a slab with each of its numbers `finite`."""
-    total = g.color[0] + g.color[1] + g.color[2] + g.opacity + g.transmittance + g.log_transmittance
-    total += g.weight + g.thickness + g.back
-    if wp.isfinite(total):
-        # Nearly always: one infinity or NaN anywhere would show in the sum.
-        return g
-    return type(g)(
-        wp.vector(finite(g.color[0]), finite(g.color[1]), finite(g.color[2])),
-        finite(g.opacity),
-        finite(g.transmittance),
-        finite(g.log_transmittance),
-        finite(g.weight),
-        finite(g.thickness),
-        finite(g.back),
-    )
