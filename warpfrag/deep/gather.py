@@ -49,6 +49,24 @@ class GatherOptions:
         return {"S": self.sum_count, "O": self.object_count, "Q": self.primitive_count}
 
 
+@wp.func(inline=True)
+def copy_fragment(source: Any, at: int, out: Any, fragment: int):
+    """Copy one fragment; what the result does not have is left out."""
+    rgba = source.rgba[at]
+    out.rgba[fragment] = rgba
+    out.depth[fragment] = source.depth[at]
+    out.thickness[fragment] = source.thickness[at]
+    if out.opacity_sum.shape[0] > 0:
+        opacity_sum = rgba[3]
+        if source.opacity_sum.shape[0] > 0:
+            opacity_sum = source.opacity_sum[at]
+        out.opacity_sum[fragment] = opacity_sum
+    if out.object_id.shape[0] > 0:
+        out.object_id[fragment] = source.object_id[at]
+    if out.primitive_id.shape[0] > 0:
+        out.primitive_id[fragment] = source.primitive_id[at]
+
+
 @kernels
 def gather_fwd(number: Any) -> Any:
     """Return the kernel that gathers fragments from two lists."""
@@ -71,23 +89,11 @@ def gather_fwd(number: Any) -> Any:
         """
         first_count = first.depth.shape[0]
         for fragment in range(span.begin + wp.tid(), span.end, span.stride):
-            source = first
             at = index[fragment]
-            if at >= first_count:
-                source = second
-                at -= first_count
-            out.rgba[fragment] = source.rgba[at]
-            out.depth[fragment] = source.depth[at]
-            out.thickness[fragment] = source.thickness[at]
-            if out.opacity_sum.shape[0] > 0:
-                opacity_sum = source.rgba[at][3]
-                if source.opacity_sum.shape[0] > 0:
-                    opacity_sum = source.opacity_sum[at]
-                out.opacity_sum[fragment] = opacity_sum
-            if out.object_id.shape[0] > 0:
-                out.object_id[fragment] = source.object_id[at]
-            if out.primitive_id.shape[0] > 0:
-                out.primitive_id[fragment] = source.primitive_id[at]
+            if at < first_count:
+                copy_fragment(first, at, out, fragment)
+            else:
+                copy_fragment(second, at - first_count, out, fragment)
 
     return kernel
 

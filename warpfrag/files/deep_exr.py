@@ -132,7 +132,8 @@ def _read(path: Path, part: int | str | None, window: DeepWindow) -> Fragments:
     source = Source(path, path.parent)
     try:
         file = DeepFile(read_regular(path, "a deep image"))
-        fragments = concat(*(_fragments(file, index, window, source) for index in _chosen(file.parts, part, source)))
+        found = [_fragments(file, index, window, source) for index in _chosen(file.parts, part, source)]
+        fragments = found[0] if len(found) == 1 else concat(*found)
     except (ValueError, OSError) as error:
         raise ImageError(f"{wording_of_path(path)}: {_reason(error)}") from error
     source.warn()

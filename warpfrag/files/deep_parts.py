@@ -21,7 +21,7 @@ from warpfrag.files.pixels import check_pixels
 MOST_SAMPLES = 2**28
 _MAGIC = b"\x76\x2f\x31\x01"
 _DEEP, _SEVERAL_PARTS = 0x800, 0x1000
-_NUMBERS = {0: np.dtype("<u4"), 1: np.dtype("<f2"), 2: np.dtype("<f4")}
+_NUMBERS: dict[int, np.dtype] = {0: np.dtype("<u4"), 1: np.dtype("<f2"), 2: np.dtype("<f4")}
 _NONE, _RLE, _ZIPS = range(3)
 _SCALARS = {"int": "<i", "float": "<f", "double": "<d"}
 _CUT = "got a file that ends early, expected a whole one"
