@@ -188,7 +188,7 @@ def test_arguments_are_checked():
     with pytest.raises(ValueError, match="max_layers: got 0"):
         render(setting, max_layers=0)
     with pytest.raises(ValueError, match="beta: got 2"):
-        render(setting, beta=2.0)
+        render(setting, beta=2.0, bounds="error")
     with pytest.raises(ValueError, match="beta: got shape"):
         render(setting, beta=np.zeros((3, 3)))
     with pytest.raises(ValueError, match="unknown name"):

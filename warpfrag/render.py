@@ -13,7 +13,7 @@ from warpfrag.capture.coverage import Coverage, store_coverage
 from warpfrag.capture.memory import Budget, CaptureSizes, split_rows
 from warpfrag.capture.surfaces import CameraSurfaces, SurfaceTables, check_scene, surfaces_of
 from warpfrag.composite import composite
-from warpfrag.errors import check_choice
+from warpfrag.errors import check_choice, check_number, is_number
 from warpfrag.fragments import Fragments
 from warpfrag.raster.ray import Window
 from warpfrag.resolve.options import check_options
@@ -82,6 +82,9 @@ class Renderer:
         memory_limit: float | None = None,
     ):
         self.camera = check_scene(scene, camera)
+        if is_number(beta):
+            # Nobody optimises a plain number: out of its range it is a mistake.
+            check_number("beta", beta, 0.0, 1.0)
         self.scene, self.resolve, self.beta = scene, resolve, beta
         self.max_layers = scene.layers if max_layers is None else max_layers
         self.merge, self.mix = merge or scene.merge, mix or scene.mix
@@ -91,6 +94,7 @@ class Renderer:
             check_kbuffer(self.max_layers, self.merge, "mix")
         else:
             check_options(self.merge, self.mix, self.max_layers)
+        self.max_layers = int(self.max_layers)
         self._tables: SurfaceTables | None = None
         self._coverage: Coverage | None = None
         self._sizes: CaptureSizes | None = None
@@ -188,8 +192,15 @@ class Renderer:
         if self.resolve == "kbuffer":
             layers = kbuffer(coverage.shade_surfaces(surfaces, moved=False), self.max_layers, merge=self.merge)  # type: ignore[arg-type]
             return self._over_background(composite(layers))
-        options = {"max_layers": self.max_layers, "merge": self.merge, "mix": self.mix}
-        return self._over_background(composite(coverage.shade_surfaces(surfaces, moved=False), beta, **options))
+        return self._over_background(
+            composite(
+                coverage.shade_surfaces(surfaces, moved=False),
+                beta,
+                max_layers=self.max_layers,
+                merge=self.merge,
+                mix=self.mix,
+            )
+        )
 
     def _over_background(self, image: Any) -> Any:
         return over_background(image, self.scene.background) if self.background else image

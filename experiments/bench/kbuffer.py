@@ -48,8 +48,8 @@ def tangle(size: int, layers: int, edge: float, seed: int = 0) -> wf.Scene:
 def sides(scene: wf.Scene, slots: int) -> dict[str, Callable[[], Any]]:
     """Return what is compared, each from scene to image."""
     return {
-        "SKB+OFM": lambda: wf.composite(wf.capture_kbuffer(scene, slots=slots)),
-        "SKB": lambda: wf.composite(wf.capture_kbuffer(scene, slots=slots, merge="none")),
+        "SKB+OFM": lambda: wf.composite(wf.storage.capture_kbuffer(scene, slots=slots)),
+        "SKB": lambda: wf.composite(wf.storage.capture_kbuffer(scene, slots=slots, merge="none")),
         "DFB+SFM": lambda: wf.render(scene, max_layers=slots, merge="smooth", mix="opacity"),
     }
 

@@ -268,7 +268,7 @@ def _passes(scene: wf.Scene, repetitions: int) -> dict[str, Any]:
             times[way] = {"count": count, "store": store, "resolve": resolve}
         del fragments
         for way, merge in (("SKB", "none"), ("SKB+OFM", "order_independent")):
-            store, layers = _timed(lambda m=merge: wf.capture_kbuffer(scene, slots=SLOTS, merge=m))
+            store, layers = _timed(lambda m=merge: wf.storage.capture_kbuffer(scene, slots=SLOTS, merge=m))
             resolve, _ = _timed(lambda l=layers: wf.composite(l))  # noqa: E741
             times[way] = {"store": max(store - place, 0.0), "resolve": resolve}
             del layers

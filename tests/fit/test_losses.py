@@ -9,6 +9,8 @@ import torch
 from warpfrag.fit.losses import ImageLoss, RobustLoss, halve, psnr, pyramid, ssim
 
 MIXED = {"l1": 0.8, "ssim": 0.2}
+
+
 LOSSES = ["l2", "l1", "huber", "ssim", MIXED]
 
 
@@ -217,3 +219,19 @@ def test_psnr():
     assert psnr(image, reference) == math.inf
     with pytest.raises(ValueError, match="got 4 × 2 pixels, expected 4 × 3"):
         psnr(image[:2], reference)
+
+
+@pytest.mark.parametrize("name", ["l2", "l1", "huber"])
+def test_loss_is_the_named_one(name):
+    """Square, absolute value and Huber's function, alike for arrays and tensors; weights are slopes."""
+    residual = np.array([-0.5, -0.02, 0.0, 0.004, 0.3])
+    loss = RobustLoss.named(name, 0.05)
+    size = np.abs(residual)
+    huber = np.where(size < 0.05, 0.5 * size**2, 0.05 * (size - 0.025))
+    # The absolute value is rounded off below 1e-3, by half of that.
+    expected = {"l2": size**2, "huber": huber, "l1": np.where(size > 0, size - 5e-4, 0.0)}[name]
+    np.testing.assert_allclose(loss.rho(residual) * loss.factor, expected, rtol=1e-12)
+    np.testing.assert_allclose(loss.rho(torch.tensor(residual)).numpy(), loss.rho(residual), rtol=1e-12)
+    squares = residual**2
+    slope = (loss.rho(np.sqrt(squares + 1e-9)) - loss.rho(np.sqrt(squares))) / 1e-9
+    np.testing.assert_allclose(loss.weight(residual)[1:], slope[1:], rtol=1e-4)

@@ -5,18 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from small_scene import spheres
+from small_study import make_study
 
-from warpfrag.fit import FitParameter, Reference, Study, StudyError, fit
+from warpfrag.fit import FitParameter, StudyError, fit
 from warpfrag.fit.descent import LBFGS
 from warpfrag.fit.least_squares import LeastSquares
 from warpfrag.fit.problem import Problem
 from warpfrag.fit.second_look import falling_steps
 from warpfrag.fit.session import Session
-
-
-def make_study(parameters, *, true=None, scene=None, **options) -> Study:
-    """Return a study of the small scene against its own render."""
-    return Study(scene or spheres(), Reference(true=true or {}), parameters, **options)
 
 
 @pytest.mark.parametrize("method", ["least_squares", "lbfgs", "adam"])

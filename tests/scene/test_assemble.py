@@ -12,7 +12,11 @@ from warpfrag.scene.scene import Scene
 from warpfrag.scene.surface import SceneObject
 
 CAMERA = Camera(eye=(0, 0, 3), target=(0, 0, 0), fov=45, size=(4, 3))
+
+
 TRIANGLE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype=np.float32)
+
+
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=np.float32)
 
 
@@ -72,23 +76,6 @@ def test_empty_scene():
     assert geometry.rgba.shape == (0, 4)
     assert geometry.faces.shape == (0, 3)
     np.testing.assert_array_equal(geometry.first_face, [0])
-
-
-def test_parameters_round_trip():
-    """`parameters()` has every name, copies its arrays, and put back changes nothing."""
-    scene = two_objects()
-    parameters = scene.parameters()
-    keys = ("thickness", "color", "opacity", "vertices", "translation", "rotation")
-    names = {f"{name}.{key}" for name in ("tri", "square") for key in keys}
-    cameras = {f"camera.{key}" for key in ("translation", "rotation", "fov", "principal")}
-    assert set(parameters) == {"beta", *cameras, *names}
-    assert parameters["tri.opacity"] == 0.5
-    same = assemble(scene, parameters)
-    for name in ("vertices", "rgba", "thickness"):
-        np.testing.assert_array_equal(getattr(same, name), getattr(assemble(scene), name))
-        assert getattr(same, name).dtype == getattr(assemble(scene), name).dtype
-    parameters["tri.vertices"][:] = 9
-    assert scene.objects[0].vertices.max() == 1
 
 
 def test_overrides():
@@ -162,43 +149,6 @@ def test_refused_overrides(overrides, error, words):
     """Names, kinds, shapes and ranges are checked, with what was got and what is expected."""
     with pytest.raises(error, match=words):
         assemble(two_objects(), overrides, bounds="error")
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"name": " "}, "name"),
-        ({"faces": [[0, 1, 3]]}, "x.faces: got indices 0 to 3, expected indices from 0 to 2"),
-        ({"faces": [[0.0, 1.0, 2.0]]}, "x.faces: got float64"),
-        ({"vertices": TRIANGLE + np.nan}, "x.vertices: got nan"),
-        ({"matrix": np.zeros((4, 4))}, "x.matrix"),
-        ({"opacity": 2}, "x.opacity: got 2"),
-        ({"thickness_unit": "m"}, "x.thickness_unit"),
-        ({"texture": np.ones((2, 2, 4))}, "x.texture: got an image but no uv"),
-        ({"texture": np.ones((2, 2, 3)), "uv": np.zeros((3, 2))}, r"x.texture: got shape \(2, 2, 3\)"),
-        ({"uv": np.zeros((2, 2))}, r"x.uv: got shape \(2, 2\)"),
-        ({"shade": np.zeros(2)}, r"x.shade: got shape \(2,\)"),
-    ],
-)
-def test_refused_objects(change, words):
-    """An object checks its own arrays."""
-    with pytest.raises(ValueError, match=words):
-        SceneObject(**{"name": "x", "vertices": TRIANGLE, "faces": [[0, 1, 2]], **change})
-
-
-@pytest.mark.parametrize(
-    "change",
-    [{"beta": 2.0}, {"layers": 0}, {"merge": "smoth"}, {"mix": 1}, {"background": (1, 1, 1)}],
-)
-def test_refused_scenes(change):
-    """A scene checks its globals, and that names are unique."""
-    with pytest.raises(ValueError, match=next(iter(change))):
-        Scene(CAMERA, **change)
-    item = SceneObject("x", TRIANGLE, [[0, 1, 2]])
-    with pytest.raises(ValueError, match='got the name "x" more than once'):
-        Scene(CAMERA, [item, item])
-    with pytest.raises(ValueError, match='got the name "camera", expected another'):
-        Scene(CAMERA, [SceneObject("camera", TRIANGLE, [[0, 1, 2]])])
 
 
 def test_torch_overrides_keep_their_precision():

@@ -59,7 +59,7 @@ def test_as_many_layers_as_fragments_are_all_of_them(machine, method):
 def test_k_buffer_takes_fragments_as_they_come(machine):
     """The layers are those of the bounded capture, which streams in order of submission."""
     # So thick that the order matters: thin slabs end in the same slots in any.
-    expected = wf.capture_kbuffer(machine.scene, slots=3, parameters={"thickness": 1000.0}).numpy()
+    expected = wf.storage.capture_kbuffer(machine.scene, slots=3, parameters={"thickness": 1000.0}).numpy()
     found = machine.layers("SKB+OFM", 3, 1000.0).numpy()
     np.testing.assert_array_equal(found.count, expected.count)
     # The bounded capture may round a thickness in another place.

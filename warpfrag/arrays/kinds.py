@@ -205,7 +205,7 @@ def kind_of(array: Any) -> Kind | None:
         if kind.owns(array):
             return kind
     for library in LIBRARIES:
-        if library in sys.modules and LIBRARIES[library]().owns(array):
+        if sys.modules.get(library) is not None and LIBRARIES[library]().owns(array):
             return LIBRARIES[library]()
     return None
 

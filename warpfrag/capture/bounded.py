@@ -238,15 +238,22 @@ def capture_kbuffer(
         MemoryError: the slots would take more memory than the limit allows; nothing has been stored yet.
 
     Example:
-        >>> wf.capture_kbuffer(wf.load_scene("scenes/three_spheres.toml"), slots=4).depth.shape
+        >>> wf.storage.capture_kbuffer(wf.load_scene("scenes/three_spheres.toml"), slots=4).depth.shape
         (512, 512, 4)
     """
     camera = check_scene(scene, camera)
     map_words = _check_options(slots, merge, tail, cull, words)
     surfaces = surfaces_of(scene, camera, parameters)
-    options = {"slots": int(slots), "merge": merge, "tail": tail, "map_words": map_words}
     with surfaces.in_order():
-        return kbuffer_of_surfaces(surfaces, Window.of(surfaces.camera), memory_limit, **options)
+        return kbuffer_of_surfaces(
+            surfaces,
+            Window.of(surfaces.camera),
+            memory_limit,
+            slots=int(slots),
+            merge=merge,
+            tail=tail,
+            map_words=map_words,
+        )
 
 
 def kbuffer_of_surfaces(
@@ -310,7 +317,7 @@ def count_culled(
         ValueError: an argument is out of its range, or does not go with another.
 
     Example:
-        >>> counts = count_culled(wf.load_scene("scenes/spheres_in_sphere.toml"), slots=2, cull="occupancy")
+        >>> counts = wf.storage.count_culled(wf.load_scene("scenes/spheres_in_sphere.toml"), slots=2, cull="occupancy")
         >>> int(counts.occupancy.sum()), int(counts.fragments.sum())
         (76290, 357178)
     """

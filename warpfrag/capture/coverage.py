@@ -12,7 +12,7 @@ or changes its place in the order.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -153,8 +153,8 @@ class Coverage:
         """Return the same coverage on a device, itself if it is there."""
         if self.faces.device == device:
             return self
-        arrays = [array.to(device) for array in (self.corners, self.faces, self.offsets, self.points)]
-        return Coverage(self.scene, self.camera, self.window, *arrays, self.tables.to(device))
+        moved = {name: value.to(device) for name, value in vars(self).items() if isinstance(value, wp.array)}
+        return replace(self, **moved, tables=self.tables.to(device))
 
     def motion_gradients(
         self, parameters: Mapping[str, Any] | None, grad_rgba: Any, grad_depth: Any, grad_thickness: Any

@@ -13,14 +13,13 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from warpfrag.extras import need
-from warpfrag.fit.maps import Smoothness, coarsen, level_of, refine
+from warpfrag.fit.coordinates import Coordinate, Course, values_and_priors
 from warpfrag.fit.parameters import with_places
 from warpfrag.fit.problem import Problem, describe_run
 from warpfrag.fit.result import Run
@@ -28,78 +27,6 @@ from warpfrag.fit.session import FitError, Session, check_finite
 from warpfrag.fit.views import StudyError
 
 LBFGS_EVALUATIONS = 25
-# L-BFGS starts at least this share of the range inside the bounds, where the slope is not 0.
-INSIDE = 1e-3
-
-
-class _Coordinate:
-    """One parameter's coordinates as a torch leaf, in the way a method moves them."""
-
-    def __init__(self, problem: Problem, index: int, bent: bool) -> None:
-        self.fitted, self.device = problem.study.parameters[index], problem.processes.device
-        self.lower, self.upper = self.fitted.coordinate_bounds
-        self.bent = bent and math.isfinite(self.lower)
-        self.middle, self.half = 0.5 * (self.lower + self.upper), 0.5 * (self.upper - self.lower)
-        self.smoothness: Smoothness | None = None
-        if self.fitted.smoothness:
-            self.smoothness = Smoothness(self.fitted, problem.study.scene, self.device)
-        self.leaf: Any = None
-
-    def put(self, coordinate: np.ndarray, stage: int) -> None:
-        """Make a new leaf for coordinates, on the grid of a stage."""
-        import torch
-
-        whole = torch.tensor(coordinate.reshape(self.fitted.start.shape), dtype=torch.float64, device=self.device)
-        leaf = coarsen(whole, level_of(self.fitted, stage))
-        if self.bent:
-            leaf = self.half * torch.asin(((leaf - self.middle) / self.half).clamp(INSIDE - 1.0, 1.0 - INSIDE))
-        self.leaf = leaf.requires_grad_()
-
-    def coordinate(self) -> Any:
-        """Return the coordinates, differentiable in the leaf."""
-        inside = self.middle + self.half * (self.leaf / self.half).sin() if self.bent else self.leaf
-        return refine(inside, self.fitted.start.shape) if self.fitted.levels > 1 else inside
-
-    def project(self) -> None:
-        """Put the leaf back between the bounds."""
-        if not self.bent and math.isfinite(self.lower):
-            self.leaf.data.clamp_(self.lower, self.upper)
-
-
-@dataclass
-class _Course:
-    """Where the fit from one start has come to, but for leaves and optimiser.
-
-    Attributes:
-        begin: steps of all starts before it.
-        best: coordinates of the least loss.
-        best_loss: the least loss.
-        evaluations: times that the images were computed.
-        stage: of the maps' grids.
-        stage_end: steps from this start after which the stage ends.
-        scores: losses in this stage that the stopping rule goes by.
-        scale: what L-BFGS divides losses by, its first; 0 before.
-    """
-
-    begin: int
-    best: np.ndarray
-    best_loss: float = math.inf
-    evaluations: int = 0
-    stage: int = 0
-    stage_end: int = 0
-    scores: list[float] = field(default_factory=list)
-    scale: float = 0.0
-
-    def to_state(self) -> dict[str, Any]:
-        """Return it as a checkpoint keeps it."""
-        import torch
-
-        return {**vars(self), "best": torch.tensor(self.best), "scores": list(self.scores)}
-
-    @staticmethod
-    def from_state(state: Mapping[str, Any]) -> "_Course":
-        """Return what `to_state` has made a state of."""
-        return _Course(**{**state, "best": state["best"].cpu().numpy(), "scores": list(state["scores"])})
 
 
 class Descent(ABC):
@@ -121,7 +48,7 @@ class Descent(ABC):
             reason = str(error).splitlines()[0]
             raise StudyError(f"device: got {study.asked.device!r}, which torch cannot use ({reason})") from None
         self.problem, self.session, self.study = problem, session, study
-        self.coordinates = [_Coordinate(problem, index, self.bent) for index in range(len(study.parameters))]
+        self.coordinates = [Coordinate(problem, index, self.bent) for index in range(len(study.parameters))]
         self.stages = max(each.levels for each in study.parameters)
         # Where each start has come to.
         self.states: list[dict[str, Any]] = list(session.state.get("runs", []))
@@ -183,7 +110,7 @@ class Descent(ABC):
 
     def begin(self, start: np.ndarray) -> None:
         """Begin the course from a start, in the first stage."""
-        self.course = _Course(len(self.session.losses), start)
+        self.course = Course(len(self.session.losses), start)
         self._enter(0, start, self.study.steps // self.stages)
 
     @property
@@ -245,7 +172,7 @@ class Descent(ABC):
                 (each, self.torch.as_tensor(coordinates[place].reshape(fitted.start.shape), device=each.device))
                 for each, (fitted, place) in zip(self.coordinates, with_places(self.study.parameters), strict=True)
             ]
-            return self._loss_of(*_values_and_priors(moved))
+            return self._loss_of(*values_and_priors(moved))
 
     def _loss_of(self, values: Mapping[str, Any], priors: list[Any]) -> float:
         mine = self.problem.processes.share(list(range(len(self.problem.views))))
@@ -255,7 +182,7 @@ class Descent(ABC):
 
     def _values_and_priors(self) -> tuple[dict[str, Any], list[Any]]:
         """Return the parameters by name, and the priors of those that have one, differentiable in the leaves."""
-        return _values_and_priors([(coordinate, coordinate.coordinate()) for coordinate in self.coordinates])
+        return values_and_priors([(coordinate, coordinate.coordinate()) for coordinate in self.coordinates])
 
     def vector(self) -> np.ndarray:
         """Return all coordinates as one vector."""
@@ -293,18 +220,13 @@ class Descent(ABC):
 
     def _restore(self, state: dict[str, Any]) -> None:
         """Take up where a checkpoint was written."""
-        course = _Course.from_state(state["course"])
+        course = Course.from_state(state["course"])
         self._enter(course.stage, self.vector(), course.stage_end)
         self.course = course
         for coordinate, leaf in zip(self.coordinates, state["leaves"], strict=True):
             coordinate.leaf.data.copy_(leaf)
         self.torch_optimizer.load_state_dict(state["optimizer"])
         self.session.losses += state["losses"]
-
-
-def _values_and_priors(moved: list[tuple[_Coordinate, Any]]) -> tuple[dict[str, Any], list[Any]]:
-    values = {each.fitted.name: each.fitted.to_value(tensor) for each, tensor in moved}
-    return values, [each.smoothness(tensor) for each, tensor in moved if each.smoothness]
 
 
 class Adam(Descent):

@@ -45,6 +45,10 @@ def fit(
     and L-BFGS take any parameters. Coverage is held fixed in gradients: vertices, transforms and cameras move by what
     they do to depth and attributes inside of triangles; the images themselves are always those of the moved scene.
 
+    At the end small steps are tried: a fit that they would carry on has not converged. Parameters with which the images
+    change by what the gradient does not see, and jumps of smooth merging where they matter, are named (see
+    `fit.second_look`).
+
     Started by `torchrun`, the processes share the views among themselves and come to the same result as one, to
     rounding; only the first of them writes files and shows progress.
 

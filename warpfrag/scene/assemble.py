@@ -11,13 +11,13 @@ NumPy and torch round alike, and no matrix product is left to what autocast make
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
-from warpfrag.arrays.kinds import NUMPY, Kind, dtype_name, kind_of
-from warpfrag.errors import check_choice, shorten
+from warpfrag.errors import check_choice
 from warpfrag.scene.camera import Camera
+from warpfrag.scene.frame import Frame, Precision, checked_overrides
 from warpfrag.scene.lens import Lens, through_lens
 from warpfrag.scene.light import transformed_normals, turned_normals
 from warpfrag.scene.names import CAMERA, POSE_KEYS
@@ -30,14 +30,11 @@ from warpfrag.scene.parameters import (
     VERTICES,
     Bounds,
     Parameter,
-    check_name,
 )
 from warpfrag.scene.pose import move_object
 from warpfrag.scene.rotation import rotation_matrix
 from warpfrag.scene.scene import Scene
 from warpfrag.scene.surface import SceneObject
-
-Precision = Literal["float32", "float64"]
 
 
 @dataclass(frozen=True)
@@ -82,61 +79,6 @@ class Geometry:
     camera_pose: tuple[Any, Any] | None = None
 
 
-@dataclass(frozen=True)
-class Frame:
-    """What arrays a scene is assembled in.
-
-    Attributes:
-        kind: the kind of arrays.
-        precision: of all but coordinates.
-        like: an array of that kind and precision, on its device.
-    """
-
-    kind: Kind
-    precision: Precision
-    like: Any
-
-    @staticmethod
-    def of(overrides: Mapping[str, Any], known: Mapping[str, Parameter]) -> "Frame":
-        """Return the frame that a set of overrides asks for.
-
-        Raises:
-            TypeError: arrays of two libraries.
-            ValueError: arrays on different devices.
-        """
-        arrays, kinds, devices = {}, {}, {}
-        for name, value in overrides.items():
-            kind = kind_of(value)
-            if kind is not None and kind is not NUMPY:
-                arrays[name], kinds[kind.name], devices[str(kind.device_of(value))] = value, name, name
-        if len(kinds) > 1:
-            (kind_name, name), (other, other_name) = list(kinds.items())[:2]
-            raise TypeError(f"parameters: got {name} of {kind_name} and {other_name} of {other}, expected one library")
-        if len(devices) > 1:
-            (device, name), (other, other_name) = list(devices.items())[:2]
-            raise ValueError(f"parameters: got {name} on {device} and {other_name} on {other}, expected one device")
-        asking = [*arrays.values()]
-        # Vertices that an object keeps in float64 say where it stands (far away), and nothing of the image.
-        asking += [v for n, v in overrides.items() if isinstance(v, np.ndarray) and not known[n].keeps_float64]
-        precision: Precision = "float64" if any(dtype_name(value) == "float64" for value in asking) else "float32"
-        kind = kind_of(next(iter(arrays.values()))) if arrays else NUMPY
-        assert kind is not None
-        like = kind.astype(next(iter(arrays.values())), precision) if arrays else np.zeros(0, precision)
-        return Frame(kind, precision, like)
-
-    def array(self, value: Any) -> Any:
-        """Return a number or an array in this kind and precision."""
-        if self.kind.owns(value):
-            return self.kind.astype(value, self.precision)
-        return self.kind.asarray(np.asarray(value), self.like)
-
-    def double(self, value: Any) -> Any:
-        """Return a number or an array in this kind, in float64."""
-        if self.kind.owns(value):
-            return self.kind.astype(value, "float64")
-        return self.kind.asarray(np.asarray(value, np.float64), self.kind.astype(self.like, "float64"))
-
-
 def assemble(
     scene: Scene,
     parameters: Mapping[str, Any] | None = None,
@@ -172,7 +114,7 @@ def assemble(
     check_choice("bounds", bounds, BOUNDS)
     camera = camera or scene.camera
     known = scene.described()
-    scene, overrides = _checked(scene, parameters or {}, known)
+    scene, overrides = checked_overrides(scene, parameters or {}, known)
     frame = Frame.of(overrides, known)
     camera, lens = through_lens(camera, overrides, known, bounds, frame.double)
     if COMMON_THICKNESS.key in overrides:
@@ -180,58 +122,67 @@ def assemble(
         common = known[COMMON_THICKNESS.key].bounded(frame.array(overrides[COMMON_THICKNESS.key]), bounds)
         known[COMMON_THICKNESS.key].check(common, camera.shape)
         overrides[COMMON_THICKNESS.key] = common
-    vertices, rgba, thickness, faces, uv, texture_id = [], [], [], [], [], []
-    textures: list[np.ndarray] = []
-    thickness_maps: dict[int, Any] = {}
-    first_vertex = 0
-    textured = any(item.texture is not None for item in scene.objects)
-    xp = frame.kind.xp
     camera_pose = _pose(CAMERA, overrides, known, frame)
     # The camera as light goes with it.
     eye = camera if camera_pose is None else camera.moved(*(frame.kind.to_numpy(value) for value in camera_pose))
+    vertices, rgba, thickness = [], [], []
+    thickness_maps: dict[int, Any] = {}
+    xp = frame.kind.xp
     for index, item in enumerate(scene.objects):
         values = _values(item, overrides, known, frame, camera, bounds)
         count = len(item.vertices)
         pose = _pose(item.name, overrides, known, frame)
-        vertices.append(world_vertices_of(values[VERTICES], item, pose, frame))
+        world = world_vertices_of(values[VERTICES], item, pose, frame)
+        vertices.append(world)
         color = xp.broadcast_to(values[COLOR], (count, 3))
         if item.shade is not None:
             color = color * frame.array(item.shade)[:, None]
         if scene.light is not None and item.normals is not None:
             own = values[VERTICES] if f"{item.name}.{VERTICES.key}" in overrides else None
-            normals = world_normals_of(item, own, pose, frame)
-            points = frame.kind.to_numpy(vertices[-1])
-            color = color * frame.array(scene.light.factor(normals, points, eye))[:, None]
+            factor = scene.light.factor(world_normals_of(item, own, pose, frame), frame.kind.to_numpy(world), eye)
+            color = color * frame.array(factor)[:, None]
         opacity = xp.broadcast_to(values[OPACITY], (count,))
         rgba.append(xp.concatenate([color, opacity[:, None]], 1))
         if len(values[THICKNESS].shape) == 2:
             thickness_maps[index] = values[THICKNESS]
             values[THICKNESS] = frame.array(0.0)
         thickness.append(xp.broadcast_to(values[THICKNESS], (count,)))
-        faces.append(item.faces + np.int32(first_vertex))
-        texture_id.append(_texture_ids(item, len(textures)))
-        textures.extend(item.textures)
-        if textured:
-            uv.append(item.uv if item.uv is not None else np.zeros((count, 2), dtype=np.float32))
-        first_vertex += count
-    face_counts = [len(item.faces) for item in scene.objects]
     return Geometry(
         vertices=xp.concatenate([frame.double(np.zeros((0, 3))), *vertices]),
-        faces=np.concatenate([np.zeros((0, 3), dtype=np.int32), *faces]),
         rgba=xp.concatenate([frame.array(np.zeros((0, 4))), *rgba]),
         thickness=xp.concatenate([frame.array(np.zeros(0)), *thickness]),
-        object_id=np.repeat(np.arange(len(face_counts), dtype=np.int32), face_counts),
-        first_face=np.concatenate([[0], np.cumsum(face_counts)]).astype(np.int32),
-        uv=np.concatenate(uv) if textured else None,
-        texture_id=np.concatenate([np.zeros(0, dtype=np.int32), *texture_id]),
-        textures=textures,
         thickness_maps=thickness_maps,
-        thickness_in_p=np.array([item.thickness_unit == "P" for item in scene.objects], dtype=bool),
         camera=camera,
         lens=lens,
         precision=frame.precision,
         camera_pose=camera_pose,
+        **_tables(scene),
     )
+
+
+def _tables(scene: Scene) -> dict[str, Any]:
+    """Return what of a geometry no parameter changes."""
+    faces, uv, texture_id = [], [], []
+    textures: list[np.ndarray] = []
+    first_vertex = 0
+    textured = any(item.texture is not None for item in scene.objects)
+    for item in scene.objects:
+        faces.append(item.faces + np.int32(first_vertex))
+        texture_id.append(_texture_ids(item, len(textures)))
+        textures.extend(item.textures)
+        if textured:
+            uv.append(item.uv if item.uv is not None else np.zeros((len(item.vertices), 2), dtype=np.float32))
+        first_vertex += len(item.vertices)
+    face_counts = [len(item.faces) for item in scene.objects]
+    return {
+        "faces": np.concatenate([np.zeros((0, 3), dtype=np.int32), *faces]),
+        "object_id": np.repeat(np.arange(len(face_counts), dtype=np.int32), face_counts),
+        "first_face": np.concatenate([[0], np.cumsum(face_counts)]).astype(np.int32),
+        "uv": np.concatenate(uv) if textured else None,
+        "texture_id": np.concatenate([np.zeros(0, dtype=np.int32), *texture_id]),
+        "textures": textures,
+        "thickness_in_p": np.array([item.thickness_unit == "P" for item in scene.objects], dtype=bool),
+    }
 
 
 def world_vertices_of(own: Any, item: SceneObject, pose: tuple[Any, Any] | None, frame: Frame) -> Any:
@@ -308,35 +259,3 @@ def _texture_ids(item: SceneObject, first: int) -> np.ndarray:
     if item.texture_index is None:
         return np.full(len(item.faces), first, dtype=np.int32)
     return np.where(item.texture_index < 0, -1, item.texture_index + first).astype(np.int32)
-
-
-def _checked(
-    scene: Scene, parameters: Mapping[str, Any], known: Mapping[str, Parameter]
-) -> tuple[Scene, dict[str, Any]]:
-    """Return the overrides as arrays or plain numbers, and the scene in the units that texts among them say."""
-    if not isinstance(parameters, Mapping):
-        raise TypeError(f"parameters: got {type(parameters).__name__}, expected a mapping from names to values")
-    for name in parameters:
-        check_name(name, known, "parameters")
-    scene, parameters = scene.in_units_of(parameters)
-    return scene, {name: _checked_array(name, value) for name, value in parameters.items()}
-
-
-def _checked_array(name: str, value: Any) -> Any:
-    kind = kind_of(value)
-    if kind is not None and kind is not NUMPY and kind.xp is not None:
-        if dtype_name(value) not in ("float32", "float64"):
-            expected = f"a {kind.type_name} of float32 or float64"
-            raise ValueError(f"{name}: got a {kind.type_name} of {dtype_name(value)}, expected {expected}")
-        return value
-    if isinstance(value, bool) or not isinstance(value, (int, float, list, tuple, np.ndarray, np.number)):
-        got = type(value).__module__ + "." + type(value).__name__
-        raise TypeError(f"{name}: got {got}, expected a number, a NumPy array or a torch tensor")
-    try:
-        array = np.asarray(value)
-    except ValueError:
-        array = np.asarray(None)
-    if array.dtype.kind not in "fiu":
-        raise ValueError(f"{name}: got {shorten(value)}, expected numbers")
-    # A plain number or list says nothing about precision: it stays Python's.
-    return value

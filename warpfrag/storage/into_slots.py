@@ -11,7 +11,7 @@ from typing import Any, Literal, get_args
 import warp as wp
 
 from warpfrag.arrays.operator import Output
-from warpfrag.arrays.precisions import Precisions, in_precisions
+from warpfrag.arrays.precisions import in_precisions
 from warpfrag.errors import check_choice, check_whole
 from warpfrag.storage.method import Room, Stage, Storage
 from warpfrag.storage.occupancy import (
@@ -69,20 +69,20 @@ class Source:
     """Where a k-buffer gets to know what a fragment looks like.
 
     Attributes:
-        arrays: structure of both precisions.
+        arrays: its structure in both precisions.
         locate: `(arrays, pixel, item) -> place`: whatever the other two take.
         front: `(arrays, pixel, item, place, depth)`: the front depth, in the precision of `depth`.
         color: `(arrays, pixel, item, place, depth)`: colour times weight and opacity, and the opacity sum.
     """
 
-    arrays: Precisions
+    arrays: Any
     locate: wp.Function
     front: wp.Function
     color: wp.Function
 
 
 @cache
-def kbuffer_arrays(source: Source) -> Precisions:
+def kbuffer_arrays(source: Source) -> Any:
     """Return the structure of a k-buffer that is fed by a source."""
     arrays = source.arrays
 
@@ -92,7 +92,7 @@ def kbuffer_arrays(source: Source) -> Precisions:
 
         slots: Slots
         occupancy: Occupancy
-        source: arrays  # type: ignore[valid-type]
+        source: arrays
 
     return KBuffer
 

@@ -164,12 +164,25 @@ def scan_counts(counts: wp.array) -> tuple[wp.array, int]:
     Raises:
         ValueError: there are more fragments than 32-bit offsets can count.
     """
+    return _scan(counts, inclusive=False)
+
+
+def offsets_of(counts: wp.array) -> tuple[wp.array, int]:
+    """Return the offsets of lists of so many fragments (P + 1,), and the number of all.
+
+    Raises:
+        ValueError: there are more fragments than 32-bit offsets can count.
+    """
+    return _scan(counts, inclusive=True)
+
+
+def _scan(counts: wp.array, *, inclusive: bool) -> tuple[wp.array, int]:
     total = int(counts.numpy().sum(dtype=np.int64))
     if total > MOST_FRAGMENTS:
         raise ValueError(
             f"capture: got {total} fragments, expected at most {MOST_FRAGMENTS}; capture fewer rows at a time"
         )
-    starts = wp.zeros(counts.shape[0] + 1, dtype=int, device=counts.device)
+    scanned = wp.zeros(counts.shape[0] + 1, dtype=int, device=counts.device)
     if counts.shape[0]:
-        wp.utils.array_scan(counts, starts[1:], inclusive=False)
-    return starts, total
+        wp.utils.array_scan(counts, scanned[1:], inclusive=inclusive)
+    return scanned, total

@@ -132,7 +132,8 @@ class Setting:
         self.thinnest, self.thickest = (share * case.depth for share in THICKNESSES)
         self.residual_count = 4 * size * size * len(self.views)
         study = self.study(dict.fromkeys(self.names, 0.5), [np.zeros((size, size, 4), np.float32)] * len(self.views))
-        self.frozen = [FrozenView(study, view, index, study.device) for index, view in enumerate(study.prepared.views)]
+        prepared = study.prepared
+        self.frozen = [FrozenView(prepared, view, index, study.device) for index, view in enumerate(prepared.views)]
 
     def draw(self, generator: np.random.Generator) -> dict[str, float]:
         """Draw parameter values."""
@@ -164,7 +165,7 @@ class Setting:
     def problem(self, study: Study) -> Problem:
         """Return a study's problem, with what has been captured already."""
         problem = Problem(study)
-        problem.views = [FrozenView(study, view.view, view.index, view.device) for view in problem.views]
+        problem.views = [FrozenView(problem.study, view.view, view.index, view.device) for view in problem.views]
         for view, frozen in zip(problem.views, self.frozen, strict=True):
             view.coverage, view.unit = frozen.coverage, frozen.unit
         return problem
@@ -259,7 +260,7 @@ def _least_squares(problem: Problem, meter: Meter) -> None:
         key, cost = min(fit.costs.items(), key=lambda item: item[1])
         meter.record(images + len(fit.costs), passes + COLORS * len(fit.jacobians), cost, np.frombuffer(key))
 
-    fit = LeastSquares(problem, Session(problem.study, "", None, look, 0.0))
+    fit = LeastSquares(problem, Session(problem.study.asked, "", None, look, 0.0))
     try:
         fit.run(problem.start())
     finally:
@@ -275,7 +276,7 @@ def _descend(problem: Problem, meter: Meter) -> None:
         meter.record(images + course.evaluations, passes + course.evaluations, course.best_loss, course.best)
 
     method = {"adam": Adam, "lbfgs": LBFGS}[str(problem.study.method)]
-    fit = method(problem, Session(problem.study, "", None, look, 0.0))
+    fit = method(problem, Session(problem.study.asked, "", None, look, 0.0))
     fit.run(problem.start())
 
 

@@ -13,7 +13,7 @@ from warpfrag.raster.ray import Window
 from warpfrag.raster.triangles import prepare_triangles
 from warpfrag.shapes.primitives import sphere, torus
 from warpfrag.storage.lists import DYNAMIC, sort_lists
-from warpfrag.storage.method import Room, count_fragments, fill, scan_counts
+from warpfrag.storage.method import Room, count_fragments, fill
 
 
 def counts_of(points, faces, camera, rows=None) -> np.ndarray:
@@ -191,12 +191,6 @@ def test_unsorted_fragments_come_as_submitted():
     for name in ("rgba", "depth", "thickness", "object_id", "primitive_id"):
         np.testing.assert_array_equal(getattr(found, name), getattr(by_depth, name)[order])
     np.testing.assert_array_equal(found.offsets, by_depth.offsets)
-
-
-def test_too_many_fragments_for_offsets_are_refused():
-    """More fragments than int32 counts are an error, not an overflow."""
-    with pytest.raises(ValueError, match="4294967294 fragments, expected at most 2147483647"):
-        scan_counts(wp.array(np.full(2, 2**31 - 1, np.int32), device="cpu"))
 
 
 @pytest.mark.parametrize("objects", [[], [quad(-2.0)], [quad(200.0)]], ids=["none", "behind", "beyond"])
