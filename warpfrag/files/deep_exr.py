@@ -105,9 +105,7 @@ def write_deep(
     name = wording_of_path(path)
     if not isinstance(source, (Fragments, Layers)):
         raise TypeError(f"source: got {shorten(source)}, expected Fragments or Layers")
-    if Path(path).suffix.lower() != ".exr":
-        raise ImageError(f"{name}: got the suffix {Path(path).suffix or '(none)'}, expected .exr")
-    check_target(path)
+    check_deep_target(path)
     fragments = _of_layers(source.numpy()) if isinstance(source, Layers) else source.numpy()
     fragments.validate()
     if len(fragments.shape) != 2 or fragments.pixel_count == 0:
@@ -126,6 +124,19 @@ def write_deep(
             file.write(str(partial))
     except OSError as error:
         raise ImageError(f"{name}: cannot be written ({error.strerror or error})") from error
+
+
+def check_deep_target(path: str | os.PathLike) -> None:
+    """Raise what `write_deep` would about the name, before time is spent on what is to be written.
+
+    Raises:
+        ImageError: the suffix or the folder is not usable, or no regular file is in the file's place.
+        ImportError: OpenEXR is not installed.
+    """
+    suffix = Path(path).suffix
+    if suffix.lower() != ".exr":
+        raise ImageError(f"{wording_of_path(path)}: got the suffix {suffix or '(none)'}, expected .exr")
+    check_target(path)
 
 
 def _read(path: Path, part: int | str | None, window: DeepWindow) -> Fragments:
