@@ -1,9 +1,10 @@
-"""Moving fragments: the operator that gathers them from two lists by an index.
+"""Moving fragments: the operator that gathers them from up to four lists by an index.
 
 On the way back each fragment takes the gradient of where it went, and none where it went nowhere. Differentiable in
 `rgba`, `depth`, `thickness` and `opacity_sum`; which fragment goes where is held fixed.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -22,6 +23,9 @@ wp.set_module_options({"enable_backward": False})
 
 IDS = ("object_id", "primitive_id")
 BY_FRAGMENT = ("rgba", "depth", "thickness", "opacity_sum", *IDS)
+# What the names of each list's arrays begin with. Four at once: putting images together by twos would take two passes.
+LISTS = ("", "second_", "third_", "fourth_")
+MOST_LISTS = len(LISTS)
 
 
 @in_precisions
@@ -69,12 +73,14 @@ def copy_fragment(source: Any, at: int, out: Any, fragment: int):
 
 @kernels
 def gather_fwd(number: Any) -> Any:
-    """Return the kernel that gathers fragments from two lists."""
+    """Return the kernel that gathers fragments from four lists."""
 
     def kernel(
         span: Span,
         first: FragmentValues[number],
         second: FragmentValues[number],
+        third: FragmentValues[number],
+        fourth: FragmentValues[number],
         index: wp.array(dtype=int),
         out: FragmentValues[number],
     ):
@@ -84,23 +90,31 @@ def gather_fwd(number: Any) -> Any:
             span: fragments of the result.
             first: fragments with the numbers from 0 on.
             second: fragments with the numbers after those.
+            third: the same.
+            fourth: the same.
             index: which fragment each of the result is, (N,).
             out: output: the result.
         """
-        first_count = first.depth.shape[0]
+        begin_second = first.depth.shape[0]
+        begin_third = begin_second + second.depth.shape[0]
+        begin_fourth = begin_third + third.depth.shape[0]
         for fragment in range(span.begin + wp.tid(), span.end, span.stride):
             at = index[fragment]
-            if at < first_count:
+            if at < begin_second:
                 copy_fragment(first, at, out, fragment)
+            elif at < begin_third:
+                copy_fragment(second, at - begin_second, out, fragment)
+            elif at < begin_fourth:
+                copy_fragment(third, at - begin_third, out, fragment)
             else:
-                copy_fragment(second, at - first_count, out, fragment)
+                copy_fragment(fourth, at - begin_fourth, out, fragment)
 
     return kernel
 
 
 @kernels
 def gather_bwd(number: Any) -> Any:
-    """Return the kernel of the gradient of gathered fragments."""
+    """Return the kernel of the gradient of gathered fragments in one of the lists."""
     vec4 = wp.types.vector(4, number)
 
     def kernel(
@@ -154,7 +168,7 @@ def _values(arrays: SimpleNamespace, number: Any, prefix: str = "") -> Any:
 
 def _gather_forward(inputs: SimpleNamespace, outputs: SimpleNamespace, options: GatherOptions) -> None:
     number, index = inputs.rgba.dtype, inputs.index
-    sources = [_values(inputs, number), _values(inputs, number, "second_")]
+    sources = [_values(inputs, number, prefix) for prefix in LISTS]
     launch(gather_fwd(number), index.shape[0], [*sources, index, _values(outputs, number)], index.device)
 
 
@@ -165,15 +179,15 @@ def _gather_backward(
     for target in vars(targets).values():
         if target is not None:
             target.zero_()
-    first_count = inputs.depth.shape[0]
-    second_count = 0 if inputs.second_depth is None else inputs.second_depth.shape[0]
-    ranges = {"": (0, first_count), "second_": (first_count, first_count + second_count)}
-    for prefix, (begin, end) in ranges.items():
-        if all(getattr(targets, prefix + name) is None for name in BY_FRAGMENT):
-            continue
-        fresh = getattr(inputs, f"{prefix}opacity_sum") is None
-        arguments = [index, begin, end, fresh, _values(grads, number), _values(targets, number, prefix)]
-        launch(gather_bwd(number), index.shape[0], arguments, index.device)
+    begin = 0
+    for prefix in LISTS:
+        depth = getattr(inputs, f"{prefix}depth")
+        end = begin + (0 if depth is None else depth.shape[0])
+        if any(getattr(targets, prefix + name) is not None for name in BY_FRAGMENT):
+            fresh = getattr(inputs, f"{prefix}opacity_sum") is None
+            arguments = [index, begin, end, fresh, _values(grads, number), _values(targets, number, prefix)]
+            launch(gather_bwd(number), index.shape[0], arguments, index.device)
+        begin = end
 
 
 def _list_inputs(prefix: str, size: str) -> tuple[Input, ...]:
@@ -186,7 +200,10 @@ def _list_inputs(prefix: str, size: str) -> tuple[Input, ...]:
 
 GATHER = Operator(
     "gather_fragments",
-    (*_list_inputs("", "F"), *_list_inputs("second_", "G"), Input("index", "N", "int")),
+    (
+        *(each for prefix, size in zip(LISTS, "FGHI", strict=True) for each in _list_inputs(prefix, size)),
+        Input("index", "N", "int"),
+    ),
     (
         *(Output("rgba", "N 4"), Output("depth", "N"), Output("thickness", "N"), Output("opacity_sum", "S")),
         *(Output("object_id", "O", "int"), Output("primitive_id", "Q", "int")),
@@ -203,29 +220,26 @@ def gathered(fragments: Fragments, index: np.ndarray, pixel: np.ndarray) -> Frag
     offsets = np.concatenate([[0], np.cumsum(counts)])
     kind = kind_named(fragments.kind)
     like = kind.astype(fragments.offsets, "int32")
-    return gather(fragments, None, *(kind.asarray(each.astype(np.int32), like) for each in (index, offsets)))
+    return gather([fragments], *(kind.asarray(each.astype(np.int32), like) for each in (index, offsets)))
 
 
-def gather(first: Fragments, second: Fragments | None, index: Any, offsets: Any) -> Fragments:
-    """Return fragments of one image or of two, which are alike.
+def gather(images: Sequence[Fragments], index: Any, offsets: Any) -> Fragments:
+    """Return fragments of up to `MOST_LISTS` images, which are alike.
 
     Args:
-        first: the fragments with the numbers from 0 on.
-        second: those with the numbers after them.
+        images: the fragments, numbered through from 0 on.
         index: which of them come where, none twice, int32, in the kind of the fragments, (N,).
         offsets: where the pixels of the result begin, (P + 1,).
     """
-    kind, count = kind_named(first.kind), index.shape[0]
-    lists = {"": first} if second is None else {"": first, "second_": second}
-    given = {name: [getattr(each, name) is not None for each in lists.values()] for name in BY_FRAGMENT}
+    kind, count = kind_named(images[0].kind), index.shape[0]
+    given = {name: [getattr(each, name) is not None for each in images] for name in BY_FRAGMENT}
     wanted = {name: all(given[name]) for name in BY_FRAGMENT} | {"opacity_sum": any(given["opacity_sum"])}
     arrays = {"index": index}
-    for prefix, each in lists.items():
-        for name in BY_FRAGMENT:
-            if wanted[name] and getattr(each, name) is not None:
-                array = getattr(each, name)
-                arrays[prefix + name] = kind.astype(array, "int32") if name in IDS else array
+    for prefix, each in zip(LISTS, images, strict=False):
+        for name in (name for name in BY_FRAGMENT if wanted[name] and getattr(each, name) is not None):
+            array = getattr(each, name)
+            arrays[prefix + name] = kind.astype(array, "int32") if name in IDS else array
     counts = [count if wanted[name] else 0 for name in ("opacity_sum", *IDS)]
     found = apply(GATHER, arrays, GatherOptions(*counts))
     values = {name: getattr(found, name) for name in BY_FRAGMENT if wanted[name]}
-    return Fragments(**values, offsets=offsets, shape=first.shape)
+    return Fragments(**values, offsets=offsets, shape=images[0].shape)

@@ -9,7 +9,7 @@ import warp as wp
 
 from warpfrag.arrays.kinds import dtype_name, kind_named
 from warpfrag.arrays.launch import Span, launch
-from warpfrag.deep.gather import gather, gathered
+from warpfrag.deep.gather import MOST_LISTS, gather, gathered
 from warpfrag.errors import shorten
 from warpfrag.fragments import Fragments
 from warpfrag.slabs.lists import longest_list
@@ -17,36 +17,52 @@ from warpfrag.slabs.lists import longest_list
 wp.set_module_options({"enable_backward": False})
 
 
+@wp.func(inline=True)
+def add_run(offsets: wp.array[int], pixel: int, first_number: int, index: wp.array[int], at: int):
+    """Write the numbers of a pixel's fragments of one image; return where those of the next go."""
+    if offsets.shape[0] > 0:
+        for fragment in range(offsets[pixel], offsets[pixel + 1]):
+            index[at] = first_number + fragment
+            at += 1
+    return at
+
+
 @wp.kernel(module="unique", enable_backward=False)
 def interleave(
     span: Span,
     first: wp.array[int],
     second: wp.array[int],
-    first_count: int,
+    third: wp.array[int],
+    fourth: wp.array[int],
+    counts: wp.vec4i,
     index: wp.array[int],
     offsets: wp.array[int],
 ):
-    """Number the fragments of two images, pixel by pixel those of the first before those of the second.
+    """Number the fragments of up to four images, pixel by pixel those of the first, then those of the second, ….
 
     Args:
         span: pixels.
         first: offsets of the first image, (P + 1,).
-        second: offsets of the second image, (P + 1,).
-        first_count: number of fragments of the first image.
-        index: output: which fragment comes where, (F + G,).
+        second: offsets of the second image, (P + 1,), or empty.
+        third: the same.
+        fourth: the same.
+        counts: number of fragments of each.
+        index: output: which fragment comes where.
         offsets: output: those of the result, (P + 1,).
     """
     for pixel in range(span.begin + wp.tid(), span.end, span.stride):
-        at = first[pixel] + second[pixel]
-        if pixel == 0:
-            offsets[0] = at
-        offsets[pixel + 1] = first[pixel + 1] + second[pixel + 1]
-        for fragment in range(first[pixel], first[pixel + 1]):
-            index[at] = fragment
-            at += 1
-        for fragment in range(second[pixel], second[pixel + 1]):
-            index[at] = first_count + fragment
-            at += 1
+        at = first[pixel]
+        if second.shape[0] > 0:
+            at += second[pixel]
+        if third.shape[0] > 0:
+            at += third[pixel]
+        if fourth.shape[0] > 0:
+            at += fourth[pixel]
+        at = add_run(first, pixel, 0, index, at)
+        at = add_run(second, pixel, counts[0], index, at)
+        at = add_run(third, pixel, counts[0] + counts[1], index, at)
+        at = add_run(fourth, pixel, counts[0] + counts[1] + counts[2], index, at)
+        offsets[pixel + 1] = at
 
 
 def concat(*fragments: Fragments, renumber: bool = False) -> Fragments:
@@ -76,11 +92,8 @@ def concat(*fragments: Fragments, renumber: bool = False) -> Fragments:
     for number, each in enumerate(fragments, 1):
         check_alike(f"fragments {number}", each, fragments[0])
     listed = _renumbered(fragments) if renumber else list(fragments)
-    # Neighbours first: each is copied as often as the logarithm of their number.
     while len(listed) > 1:
-        listed = [
-            _pair(*listed[at : at + 2]) if at + 1 < len(listed) else listed[at] for at in range(0, len(listed), 2)
-        ]
+        listed = [_together(listed[at : at + MOST_LISTS]) for at in range(0, len(listed), MOST_LISTS)]
     return listed[0]
 
 
@@ -163,13 +176,18 @@ def _renumbered(fragments: Sequence[Fragments]) -> list[Fragments]:
     return renumbered
 
 
-def _pair(first: Fragments, second: Fragments) -> Fragments:
-    """Put two together, which are known to be alike."""
-    kind, count = kind_named(first.kind), first.count + second.count
+def _together(images: Sequence[Fragments]) -> Fragments:
+    """Put up to `MOST_LISTS` images together, which are known to be alike."""
+    kind, first = kind_named(images[0].kind), images[0]
+    if len(images) == 1:
+        return first
     with kind.in_order(first.rgba):
-        ends = [kind.to_warp(kind.astype(each.offsets, "int32")) for each in (first, second)]
-        device = ends[0].device
-        index = wp.empty(count, dtype=wp.int32, device=device)
+        ends: list[Any] = [kind.to_warp(kind.astype(each.offsets, "int32")) for each in images]
+        device, absent = ends[0].device, MOST_LISTS - len(images)
+        ends += [wp.empty(0, dtype=wp.int32, device=device)] * absent
+        counts = [each.count for each in images]
+        index = wp.empty(sum(counts), dtype=wp.int32, device=device)
         offsets = wp.zeros(first.pixel_count + 1, dtype=wp.int32, device=device)
-        launch(interleave, first.pixel_count, [*ends, first.count, index, offsets], device)
-    return gather(first, second, kind.from_warp(index), kind.from_warp(offsets))
+        arguments = [*ends, wp.vec4i(*counts, *[0] * absent), index, offsets]
+        launch(interleave, first.pixel_count, arguments, device)
+    return gather(images, kind.from_warp(index), kind.from_warp(offsets))
