@@ -205,9 +205,10 @@ def _fragments(file: DeepFile, index: int, window: DeepWindow, source: Source) -
         source.note(f"leaves out the channels {', '.join(left_out)}")
     samples = file.read(index, names)
     offsets, kept, shape = _grid(samples, part, window)
-    if not kept.all():
+    values = samples.channels
+    if kept is not None and not kept.all():
         source.note(f"leaves out {np.count_nonzero(~kept)} samples outside of the display window")
-    values = {name: samples.channels[name][kept] for name in names}
+        values = {name: array[kept] for name, array in values.items()}
     floats = {name: values[name].astype(np.float32) for name in (*_NEEDED, "ZBack") if name in values}
     for name, array in floats.items():
         if not np.isfinite(array).all():
@@ -233,26 +234,25 @@ def _fragments(file: DeepFile, index: int, window: DeepWindow, source: Source) -
     )
 
 
-def _grid(samples: Samples, part: Part, window: DeepWindow) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
-    """Return offsets of the pixels of a window, which samples lie in it, and its size."""
+def _grid(samples: Samples, part: Part, window: DeepWindow) -> tuple[np.ndarray, np.ndarray | None, tuple[int, int]]:
+    """Return offsets of the pixels of a window, which samples lie in it (None: all), and its size."""
     left, top, right, bottom = part.data_window if window == "data" else part.display_window
-    shape = bottom - top + 1, right - left + 1
     own_left, own_top, own_right, own_bottom = part.data_window
-    counts = np.zeros(shape, np.int64)
+    rows, own_rows = _shared(top, bottom, own_top, own_bottom)
+    columns, own_columns = _shared(left, right, own_left, own_right)
+    counts = np.zeros((bottom - top + 1, right - left + 1), np.int64)
+    counts[rows, columns] = samples.counts[own_rows, own_columns]
     inside = np.zeros(samples.counts.shape, bool)
-    rows, columns = (
-        slice(max(begin, first), min(end, last) + 1)
-        for begin, first, end, last in ((top, own_top, bottom, own_bottom), (left, own_left, right, own_right))
-    )
-    if rows.start < rows.stop and columns.start < columns.stop:
-        there = (
-            slice(rows.start - own_top, rows.stop - own_top),
-            slice(columns.start - own_left, columns.stop - own_left),
-        )
-        here = (slice(rows.start - top, rows.stop - top), slice(columns.start - left, columns.stop - left))
-        counts[here], inside[there] = samples.counts[there], True
-    kept = np.repeat(inside.reshape(-1), samples.counts.reshape(-1))
-    return np.concatenate([[0], np.cumsum(counts)]).astype(np.int32), kept, shape
+    inside[own_rows, own_columns] = True
+    kept = None if inside.all() else np.repeat(inside.reshape(-1), samples.counts.reshape(-1))
+    return np.concatenate([[0], np.cumsum(counts)]).astype(np.int32), kept, counts.shape
+
+
+def _shared(first: int, last: int, own_first: int, own_last: int) -> tuple[slice, slice]:
+    """Return what two ranges of rows or columns share, counted from the begin of each."""
+    begin = max(first, own_first)
+    end = max(begin, min(last, own_last) + 1)
+    return slice(begin - first, end - first), slice(begin - own_first, end - own_first)
 
 
 def _ids(values: np.ndarray, name: str, source: Source) -> np.ndarray | None:
@@ -286,6 +286,9 @@ def _channels(fragments: Fragments, half: bool, name: str) -> dict[str, np.ndarr
         channels["ZBack"] = fragments.depth.astype(np.float32)
     for key, ids in ((OBJECT_IDS[0], fragments.object_id), (PRIMITIVE_IDS[0], fragments.primitive_id)):
         if ids is not None:
+            low, high = ids.min(initial=0), ids.max(initial=0)
+            if low < -(2**31) or high >= 2**32:
+                raise ImageError(f"{name}: got ids from {low} to {high}, expected 32 bits")
             channels[key] = ids.astype(np.uint32)
     return channels
 

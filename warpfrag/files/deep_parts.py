@@ -150,7 +150,9 @@ class DeepFile:
             raise ValueError("got a chunk of another part, expected one of each part's own")
         y, table_size, data_size, size = source.unpack("<iQQQ")
         table = _unpacked(source.take(table_size), 4 * width, part.compression)
-        counts = np.diff(np.frombuffer(table, "<i4"), prepend=0)
+        running = np.frombuffer(table, "<i4")
+        counts = running.copy()
+        counts[1:] -= running[:-1]
         if (counts < 0).any():
             raise ValueError(f"got counts of samples that fall in scan line {y}, expected running ones")
         return y, counts, source.take(data_size), size
