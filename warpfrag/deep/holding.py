@@ -11,7 +11,7 @@ import numpy as np
 
 from warpfrag.arrays.kinds import dtype_name, kind_named
 from warpfrag.deep.gather import IDS, gathered
-from warpfrag.deep.lists import check_alike
+from warpfrag.deep.lists import check_alike, checked
 from warpfrag.fragments import Fragments
 from warpfrag.slabs.slab import THIN, THINNEST
 
@@ -40,8 +40,7 @@ def holdout(fragments: Fragments, holder: Fragments) -> Fragments:
         TypeError: an argument is no `Fragments`, or kinds or precisions differ.
         ValueError: grids or devices differ, or offsets do not fit the fragments.
     """
-    check_alike("fragments", fragments, fragments)
-    check_alike("holder", holder, fragments)
+    check_alike("holder", checked(holder), checked(fragments))
     kind = kind_named(fragments.kind)
     if kind.xp is None:
         return _in_kind_of(fragments, holdout(fragments.numpy(), holder.numpy()))

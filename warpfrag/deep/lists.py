@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from warpfrag.arrays.kinds import dtype_name, kind_named
-from warpfrag.arrays.launch import Span, launch
+from warpfrag.arrays.launch import Span, launch, worker_count
 from warpfrag.deep.gather import MOST_LISTS, gather, gathered
 from warpfrag.errors import shorten
 from warpfrag.fragments import Fragments
@@ -27,6 +27,16 @@ def add_run(offsets: wp.array[int], pixel: int, first_number: int, index: wp.arr
     return at
 
 
+@wp.func(inline=True)
+def is_possible(offsets: wp.array[int], count: int, pixel: int):
+    """Tell whether a pixel's fragments can be those of an image that has so many."""
+    if offsets.shape[0] > 0:
+        begin = offsets[pixel]
+        end = offsets[pixel + 1]
+        return begin >= 0 and (pixel > 0 or begin == 0) and end >= begin and end <= count
+    return True
+
+
 @wp.kernel(module="unique", enable_backward=False)
 def interleave(
     span: Span,
@@ -37,6 +47,7 @@ def interleave(
     counts: wp.vec4i,
     index: wp.array[int],
     offsets: wp.array[int],
+    invalid: wp.array[int],
 ):
     """Number the fragments of up to four images, pixel by pixel those of the first, then those of the second, ….
 
@@ -49,8 +60,13 @@ def interleave(
         counts: number of fragments of each.
         index: output: which fragment comes where.
         offsets: output: those of the result, (P + 1,).
+        invalid: output: by thread, 1 if a pixel's fragments are impossible; nothing is written for that pixel.
     """
     for pixel in range(span.begin + wp.tid(), span.end, span.stride):
+        possible = is_possible(first, counts[0], pixel) and is_possible(second, counts[1], pixel)
+        if not (possible and is_possible(third, counts[2], pixel) and is_possible(fourth, counts[3], pixel)):
+            invalid[span.worker] = 1
+            continue
         at = first[pixel]
         if second.shape[0] > 0:
             at += second[pixel]
@@ -105,7 +121,7 @@ def tidy(fragments: Fragments) -> Fragments:
     Returns:
         The fragments, with offsets and ids in int32.
     """
-    host = _checked(fragments).numpy()
+    host = checked(fragments).numpy()
     kept = np.flatnonzero((host.rgba != 0.0).any(axis=1))
     pixel, depth = host.pixel[kept], host.depth[kept]
     order = np.lexsort((depth - host.thickness[kept], depth, pixel))
@@ -123,7 +139,7 @@ def split(fragments: Fragments) -> dict[int, Fragments]:
     Raises:
         ValueError: the fragments have no object ids.
     """
-    if _checked(fragments).object_id is None:
+    if checked(fragments).object_id is None:
         raise ValueError("fragments: got none with object_id, expected fragments that know their object")
     host = fragments.numpy()
     pixel = host.pixel
@@ -134,7 +150,13 @@ def split(fragments: Fragments) -> dict[int, Fragments]:
     return parts
 
 
-def _checked(fragments: Any) -> Fragments:
+def checked(fragments: Any) -> Fragments:
+    """Return fragments whose offsets fit.
+
+    Raises:
+        TypeError: it is no `Fragments`.
+        ValueError: the offsets do not fit.
+    """
     if not isinstance(fragments, Fragments):
         raise TypeError(f"fragments: got {shorten(fragments)}, expected Fragments")
     kind = kind_named(fragments.kind)
@@ -143,11 +165,11 @@ def _checked(fragments: Any) -> Fragments:
 
 
 def check_alike(name: str, each: Any, first: Fragments) -> None:
-    """Raise unless fragments have the grid, kind, precision and device of the first, and offsets that fit.
+    """Raise unless fragments have the grid, kind, precision and device of the first.
 
     Raises:
         TypeError: they are no `Fragments`, or of another kind or precision.
-        ValueError: grid or device differ, or offsets do not fit.
+        ValueError: grid or device differ.
     """
     if not isinstance(each, Fragments):
         raise TypeError(f"{name}: got {shorten(each)}, expected Fragments")
@@ -161,7 +183,6 @@ def check_alike(name: str, each: Any, first: Fragments) -> None:
         raise TypeError(f"{name}: got {dtype_name(each.rgba)}, expected {dtype_name(first.rgba)} like the first")
     if own.device_of(each.rgba) != own.device_of(first.rgba):
         raise ValueError(f"{name}: got them on {each.rgba.device}, expected {first.rgba.device} like the first")
-    _checked(each)
 
 
 def _renumbered(fragments: Sequence[Fragments]) -> list[Fragments]:
@@ -188,6 +209,11 @@ def _together(images: Sequence[Fragments]) -> Fragments:
         counts = [each.count for each in images]
         index = wp.empty(sum(counts), dtype=wp.int32, device=device)
         offsets = wp.zeros(first.pixel_count + 1, dtype=wp.int32, device=device)
-        arguments = [*ends, wp.vec4i(*counts, *[0] * absent), index, offsets]
-        launch(interleave, first.pixel_count, arguments, device)
+        rows = worker_count(first.pixel_count, device, 0)
+        invalid = wp.zeros(rows, dtype=wp.int32, device=device)
+        arguments = [*ends, wp.vec4i(*counts, *[0] * absent), index, offsets, invalid]
+        launch(interleave, first.pixel_count, arguments, device, rows)
+        if invalid.numpy().any() or offsets[-1:].numpy()[0] != sum(counts):
+            for each in images:
+                checked(each)
     return gather(images, kind.from_warp(index), kind.from_warp(offsets))
