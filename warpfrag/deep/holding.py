@@ -11,7 +11,7 @@ import numpy as np
 
 from warpfrag.arrays.kinds import dtype_name, kind_named
 from warpfrag.deep.gather import IDS, gathered
-from warpfrag.deep.lists import check_alike, checked
+from warpfrag.deep.lists import check_alike
 from warpfrag.fragments import Fragments
 from warpfrag.slabs.slab import THIN, THINNEST
 
@@ -23,7 +23,7 @@ def holdout(fragments: Fragments, holder: Fragments) -> Fragments:
     holder lets through up to it; where both fill an interval, times the share that exact merging with
     mix "optical_depth" and beta 0 gives to the part: `(1 - exp(-u - v))/(u + v) * u/(1 - exp(-u))` for the optical
     depths u of the part and v of the holder there, and the mean where both are opaque. Fragments of one image do not
-    hold out each other. What is wholly hidden is left out.
+    hold out each other. What has neither opacity nor colour left is left out.
 
     Differentiable in torch, in `rgba`, `depth` and `thickness` of both and in `opacity_sum`; not on a `wp.Tape`, where
     the result has no gradient. Held fixed: which boundaries cut a fragment, and what is left out.
@@ -38,16 +38,18 @@ def holdout(fragments: Fragments, holder: Fragments) -> Fragments:
 
     Raises:
         TypeError: an argument is no `Fragments`, or kinds or precisions differ.
-        ValueError: grids or devices differ, or offsets do not fit the fragments.
+        ValueError: grids or devices differ, offsets do not fit, or a value is not finite or out of its range.
     """
-    check_alike("holder", checked(holder), checked(fragments))
-    kind = kind_named(fragments.kind)
+    check_alike("fragments", fragments, fragments)
+    check_alike("holder", holder, fragments)
+    kind, own, other = kind_named(fragments.kind), fragments.numpy(), holder.numpy()
+    own.validate()
+    other.validate()
     if kind.xp is None:
-        return _in_kind_of(fragments, holdout(fragments.numpy(), holder.numpy()))
-    parts = _cut(fragments.numpy(), holder.numpy())
+        return _in_kind_of(fragments, holdout(own, other))
+    parts = _cut(own, other)
     values = _held_out(fragments, holder, parts)
-    host = kind.to_numpy(values["rgba"])
-    kept = np.flatnonzero((host != 0.0).any(axis=1))
+    kept = np.flatnonzero((kind.to_numpy(values["rgba"]) != 0.0).any(axis=1))
     ids = {name: getattr(fragments, name) for name in IDS if getattr(fragments, name) is not None}
     values |= {name: kind.astype(array, "int32")[parts.fragment] for name, array in ids.items()}
     whole = Fragments(**values, offsets=parts.offsets_like(fragments), shape=fragments.shape)
@@ -81,8 +83,8 @@ class _Parts:
         return kind.asarray(offsets, fragments.offsets)
 
 
-def _surfaces_thin(depth: Any, thickness: Any, xp: Any) -> Any:
-    """Return thicknesses, 0 for slabs that are too thin to be divided, as everywhere."""
+def _divisible(depth: Any, thickness: Any, xp: Any) -> Any:
+    """Return thicknesses, 0 for slabs that are too thin to be divided: they are surfaces, as everywhere."""
     thin = (thickness < THIN * abs(depth)) | (thickness < THINNEST)
     return xp.where(thin, xp.zeros_like(thickness), thickness)
 
@@ -91,7 +93,7 @@ def _cut(own: Fragments, others: Fragments) -> _Parts:
     """Cut fragments at the boundaries of others (both of them NumPy arrays)."""
     pixel = own.pixel
     back, thickness = own.depth.astype(np.float64), own.thickness.astype(np.float64)
-    front = back - _surfaces_thin(back, thickness, np)
+    front = back - _divisible(back, thickness, np)
     edges = _boundaries(others.depth.astype(np.float64), others.thickness.astype(np.float64), np)
     begins, ends = others.offsets[:-1][pixel].astype(np.int64), others.offsets[1:][pixel].astype(np.int64)
     fragments, codes = [np.arange(own.count)], [np.full(own.count, -1)]
@@ -120,7 +122,7 @@ def _cut(own: Fragments, others: Fragments) -> _Parts:
 
 def _boundaries(depth: Any, thickness: Any, xp: Any) -> Any:
     """Return front and back of each slab, one after the other, (2 F,)."""
-    return xp.stack((depth - _surfaces_thin(depth, thickness, xp), depth), 1).reshape(-1)
+    return xp.stack((depth - _divisible(depth, thickness, xp), depth), 1).reshape(-1)
 
 
 def _held_out(fragments: Fragments, holder: Fragments, parts: _Parts) -> dict[str, Any]:
@@ -131,11 +133,11 @@ def _held_out(fragments: Fragments, holder: Fragments, parts: _Parts) -> dict[st
         kind.astype(array, "float64")[parts.fragment]
         for array in (fragments.rgba, fragments.depth, fragments.thickness)
     )
-    thickness = _surfaces_thin(depth, own_thickness, xp)
+    thickness = _divisible(depth, own_thickness, xp)
     other_rgba, other_depth, other_thickness = (
         kind.astype(array, "float64") for array in (holder.rgba, holder.depth, holder.thickness)
     )
-    other_thickness = _surfaces_thin(other_depth, other_thickness, xp)
+    other_thickness = _divisible(other_depth, other_thickness, xp)
     # One more, for where a part has no boundary but its own.
     edges = xp.concatenate((_boundaries(other_depth, other_thickness, xp), kind.asarray([0.0], depth)))
     first, last = kind.asarray(parts.begin < 0, depth) != 0, kind.asarray(parts.end < 0, depth) != 0

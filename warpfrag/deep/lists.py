@@ -121,7 +121,7 @@ def tidy(fragments: Fragments) -> Fragments:
     Returns:
         The fragments, with offsets and ids in int32.
     """
-    host = checked(fragments).numpy()
+    host = _checked(fragments).numpy()
     kept = np.flatnonzero((host.rgba != 0.0).any(axis=1))
     pixel, depth = host.pixel[kept], host.depth[kept]
     order = np.lexsort((depth - host.thickness[kept], depth, pixel))
@@ -139,7 +139,7 @@ def split(fragments: Fragments) -> dict[int, Fragments]:
     Raises:
         ValueError: the fragments have no object ids.
     """
-    if checked(fragments).object_id is None:
+    if _checked(fragments).object_id is None:
         raise ValueError("fragments: got none with object_id, expected fragments that know their object")
     host = fragments.numpy()
     pixel = host.pixel
@@ -150,7 +150,7 @@ def split(fragments: Fragments) -> dict[int, Fragments]:
     return parts
 
 
-def checked(fragments: Any) -> Fragments:
+def _checked(fragments: Any) -> Fragments:
     """Return fragments whose offsets fit.
 
     Raises:
@@ -215,5 +215,5 @@ def _together(images: Sequence[Fragments]) -> Fragments:
         launch(interleave, first.pixel_count, arguments, device, rows)
         if invalid.numpy().any() or offsets[-1:].numpy()[0] != sum(counts):
             for each in images:
-                checked(each)
+                _checked(each)
     return gather(images, kind.from_warp(index), kind.from_warp(offsets))
