@@ -100,7 +100,7 @@ def test_warp_arrays_come_out_without_gradient(device):
 
 def test_what_does_not_fit_is_refused():
     """Grids that differ, and opacities out of range."""
-    with pytest.raises(ValueError, match="opacity: got 1.5"):
+    with pytest.raises(ValueError, match=r"opacity: got 1\.5"):
         wf.holdout(pixel((0.5, 0.5, 1.0, 0.0)), pixel((0.5, 1.5, 1.0, 0.0)))
     with pytest.raises(ValueError, match="holder: got a grid of 1×1 pixels, expected 1×2 like the first"):
         wf.holdout(wf.Fragments.from_lists([[], []], (1, 2)), wf.Fragments.from_lists([[]], (1, 1)))
