@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import warp as wp
 from capture_scenes import orthographic, perspective, quad, scene, soup, surface
 
 from warpfrag.capture import memory
@@ -118,7 +117,7 @@ def test_bands_have_the_same_pixels(monkeypatch):
         bands.append(memory.split_rows(*arguments))
         return bands[-1]
 
-    monkeypatch.setattr(sys.modules[render.__module__], "split_rows", split_rows)
+    monkeypatch.setattr(sys.modules[Renderer.__module__], "split_rows", split_rows)
     whole = render(setting, beta=beta)
     assert not bands
     for limit in limits(setting):
@@ -290,5 +289,3 @@ def test_renderers_arguments_are_checked():
         Renderer(crowd(), resolve="sort")
     with pytest.raises(ValueError, match='merge: got "smooth", expected "none" or "order_independent"'):
         Renderer(crowd(), resolve="kbuffer")
-    with pytest.raises(TypeError, match=r"beta: got a wp\.array"):
-        Renderer(crowd()).image({"beta": wp.zeros(1, device="cpu")})

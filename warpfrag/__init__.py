@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from warpfrag.files.scene_file import load_scene
     from warpfrag.fit import FitError, FitParameter, FitResult, Reference, Study, StudyError, View, fit, load_study
     from warpfrag.fragments import Fragments, Layers
-    from warpfrag.render import Renderer, render
+    from warpfrag.render import render
+    from warpfrag.renderer import Renderer
     from warpfrag.resolve.resolve import resolve
     from warpfrag.scene.camera import Camera
     from warpfrag.scene.depth_resolution import z_resolution
@@ -46,7 +47,7 @@ _HOMES = {
     "Fragments": "fragments",
     "Layers": "fragments",
     "Reference": "fit",
-    "Renderer": "render",
+    "Renderer": "renderer",
     "Scene": "scene.scene",
     "SceneError": "errors",
     "SceneObject": "scene.surface",

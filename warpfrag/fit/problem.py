@@ -21,7 +21,8 @@ from warpfrag.fit.scaled_fragments import UnitFragments
 from warpfrag.fit.study import PreparedStudy, Study
 from warpfrag.fit.views import Resolve, View
 from warpfrag.fragments import Fragments
-from warpfrag.render import over_background, render
+from warpfrag.render import render
+from warpfrag.samples import over_background
 from warpfrag.scene.parameters import BETA
 from warpfrag.scene.scene import Scene
 from warpfrag.storage.kbuffer import kbuffer

@@ -97,6 +97,10 @@ class Scene:
         """Return all names that `parameters=` takes: those of `parameters()`, and `"thickness"` for all objects."""
         return set(self.described())
 
+    def value_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Return the shape of one value of each parameter, by name: () for a number."""
+        return {name: parameter.kind.value_shape for name, parameter in self.described().items()}
+
     def own_value(self, name: str) -> float | np.ndarray | None:
         """Return one parameter's value, as `parameters` does; None for a common thickness where objects differ.
 
