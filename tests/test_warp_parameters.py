@@ -53,7 +53,7 @@ def as_torch(values):
 
 
 @pytest.mark.parametrize(
-    "options", [{}, {"samples": 2}, {"memory_limit": 1e5}, {"resolve": "kbuffer", "merge": "none"}]
+    "options", [{}, {"samples": 2}, {"memory_limit": 6e4}, {"resolve": "kbuffer", "merge": "none"}]
 )
 def test_gradients_on_a_tape_are_those_of_torch(options):
     """Image and gradient in every kind of parameter; going back twice adds up."""

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from warpfrag.resolve.resolve import resolve
     from warpfrag.scene.camera import Camera
     from warpfrag.scene.depth_resolution import z_resolution
+    from warpfrag.scene.light import Light
     from warpfrag.scene.scene import Scene
     from warpfrag.scene.surface import SceneObject
     from warpfrag.storage.kbuffer import kbuffer
@@ -46,6 +47,7 @@ _HOMES = {
     "FitResult": "fit",
     "Fragments": "fragments",
     "Layers": "fragments",
+    "Light": "scene.light",
     "Reference": "fit",
     "Renderer": "renderer",
     "Scene": "scene.scene",
@@ -79,6 +81,7 @@ __all__ = [
     "FitResult",
     "Fragments",
     "Layers",
+    "Light",
     "Reference",
     "Renderer",
     "Scene",
