@@ -289,3 +289,28 @@ def test_renderers_arguments_are_checked():
         Renderer(crowd(), resolve="sort")
     with pytest.raises(ValueError, match='merge: got "smooth", expected "none" or "order_independent"'):
         Renderer(crowd(), resolve="kbuffer")
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_autocast_and_matmul_precision_move_nothing(dtype):
+    """Inside of `torch.autocast`, with fast matrix products allowed, image and gradients keep their bits."""
+    setting = crowd()
+    names = ["soup.vertices", "soup.opacity", "more.rotation", "camera.translation", "camera.fov", "beta"]
+
+    def run():
+        own = setting.parameters()
+        values = {name: torch.tensor(np.asarray(own[name]), dtype=torch.float32, requires_grad=True) for name in names}
+        image = render(setting, parameters=values, samples=2)
+        return [image, *torch.autograd.grad(image.square().sum(), list(values.values()))]
+
+    expected = run()
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("high")
+    try:
+        with torch.autocast("cpu", dtype=dtype):
+            found = run()
+    finally:
+        torch.set_float32_matmul_precision(before)
+    for one, other in zip(found, expected, strict=True):
+        assert one.dtype == other.dtype
+        assert torch.equal(one, other)
