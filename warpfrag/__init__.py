@@ -22,9 +22,10 @@ if TYPE_CHECKING:
     from warpfrag.capture.coverage import capture
     from warpfrag.composite import composite
     from warpfrag.errors import SceneError
-    from warpfrag.files.images import read_image, write_image
+    from warpfrag.files.images import ImageError, read_image, write_image
     from warpfrag.files.scene_file import load_scene
     from warpfrag.fit import FitError, FitParameter, FitResult, Reference, Study, StudyError, View, fit, load_study
+    from warpfrag.fit.session import Progress
     from warpfrag.fragments import Fragments, Layers
     from warpfrag.render import render
     from warpfrag.renderer import Renderer
@@ -46,8 +47,10 @@ _HOMES = {
     "FitParameter": "fit",
     "FitResult": "fit",
     "Fragments": "fragments",
+    "ImageError": "files.images",
     "Layers": "fragments",
     "Light": "scene.light",
+    "Progress": "fit.session",
     "Reference": "fit",
     "Renderer": "renderer",
     "Scene": "scene.scene",
@@ -80,8 +83,10 @@ __all__ = [
     "FitParameter",
     "FitResult",
     "Fragments",
+    "ImageError",
     "Layers",
     "Light",
+    "Progress",
     "Reference",
     "Renderer",
     "Scene",

@@ -97,6 +97,10 @@ class Renderer:
         self._sizes: CaptureSizes | None = None
         self._centres: Renderer | None = None
 
+    def __repr__(self) -> str:
+        width, height = self.camera.size
+        return f"Renderer({self.scene!r}, {width} × {height}, {self.method.resolve})"
+
     @property
     def coverage(self) -> Coverage:
         """What each pixel (with several samples, each sample) saw the last time, or else sees in the scene as it is.
@@ -282,7 +286,7 @@ class Renderer:
                 triangles = part.triangles(replace(Window.of(surfaces.camera), first_row=first, row_count=count))
                 inside = counts[first * width : (first + count) * width]
                 coverage = store_coverage(
-                    self.scene, self.camera, part, triangles, inside, budget, sort=self.method.sorts
+                    self.scene, part.camera, part, triangles, inside, budget, sort=self.method.sorts
                 )
                 return self._pictures(coverage, part, _rows(band_beta, begin, end), wanted)
 

@@ -120,3 +120,11 @@ def test_every_name_exists():
         assert name in dir(wf.shapes)
     with pytest.raises(AttributeError, match="shapes' has no attribute 'pyramid'"):
         _ = wf.shapes.pyramid
+
+
+def test_reprs_are_short():
+    """Meshes, points and renderers say how large they are, not what is in them."""
+    scene = wf.load_scene("example:three_spheres")
+    assert repr(wf.shapes.cube()) == "Mesh(24 vertices, 12 faces)"
+    assert repr(wf.shapes.PointSet(np.zeros((4, 3)))) == "PointSet(4 points)"
+    assert repr(wf.Renderer(scene)) == f"Renderer({scene!r}, 512 × 512, sorted)"

@@ -15,7 +15,7 @@ from warpfrag.scene.surface import SceneObject
 GREY = 0.8
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Mesh:
     """Triangles and how they look, before a scene file has its say.
 
@@ -41,6 +41,9 @@ class Mesh:
     textures: list[np.ndarray] = field(default_factory=list)
     texture_index: np.ndarray | None = None
     name: str = ""
+
+    def __repr__(self) -> str:
+        return f"Mesh({len(self.vertices)} vertices, {len(self.faces)} faces)"
 
     def object(
         self,

@@ -18,7 +18,7 @@ from warpfrag.shapes.mesh import Mesh
 NEIGHBOURS = 12
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class PointSet:
     """Points of a surface.
 
@@ -33,6 +33,9 @@ class PointSet:
     normals: np.ndarray | None = None
     color: np.ndarray | None = None
     opacity: np.ndarray | None = None
+
+    def __repr__(self) -> str:
+        return f"PointSet({len(self.points)} points)"
 
 
 def surfels(points: PointSet | np.ndarray, radius: float = 2.0, segments: int = 8) -> Mesh:
