@@ -27,8 +27,8 @@ def call_with_warp(
 
     Args:
         function: takes the values and the device on which to compute, or None for that of the values; returns an array,
-            a dataclass of arrays, or a mapping to those. Given neither Warp arrays nor others it is called as it is.
-        values: by name. A number is a wp.array of one entry, as there are none without dimensions.
+            a dataclass of arrays, or a mapping to those.
+        values: by name; without Warp arrays among them the function is called as it is. A number is a wp.array of one entry, as there are none without dimensions.
         value_shapes: shape of one value, by name.
         device: on which to compute; None for that of the values.
 
@@ -122,12 +122,12 @@ def _check(arrays: Mapping[str, wp.array], values: Mapping[str, Any], device: st
 
 def _single_values(arrays: Mapping[str, Any], value_shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Any]:
     """Return arrays, those of one value in the shape of that: a number without dimensions."""
-    shapes = {name: value_shapes.get(name) for name in arrays}
-    return {
-        name: array.reshape(shape) if shape is not None and tuple(array.shape) == (1, *shape) else array
-        for name, array in arrays.items()
-        for shape in [shapes[name]]
-    }
+
+    def single(name: str, array: Any) -> Any:
+        shape = value_shapes.get(name)
+        return array.reshape(shape) if shape is not None and tuple(array.shape) == (1, *shape) else array
+
+    return {name: single(name, array) for name, array in arrays.items()}
 
 
 def _mapped(value: Any, convert: Callable[[Any], wp.array]) -> Any:
