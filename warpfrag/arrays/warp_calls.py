@@ -28,7 +28,8 @@ def call_with_warp(
     Args:
         function: takes the values and the device on which to compute, or None for that of the values; returns an array,
             a dataclass of arrays, or a mapping to those.
-        values: by name; without Warp arrays among them the function is called as it is. A number is a wp.array of one entry, as there are none without dimensions.
+        values: by name; without Warp arrays among them the function is called as it is. A number is a wp.array of one
+            entry, as there are none without dimensions.
         value_shapes: shape of one value, by name.
         device: on which to compute; None for that of the values.
 
