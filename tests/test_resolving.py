@@ -72,3 +72,13 @@ def test_bad_devices_are_named(name, message):
                  lambda: Renderer(crowd(), device=name)):  # fmt: skip
         with pytest.raises(ValueError, match=message):
             call()
+
+
+def test_parameters_are_a_mapping():
+    """Anything else is refused in one line, by all that take them."""
+    renderer = Renderer(crowd())
+    calls = (renderer.image, renderer.fragments, lambda p: render(crowd(), parameters=p),
+             lambda p: capture(crowd(), parameters=p))  # fmt: skip
+    for call in calls:
+        with pytest.raises(TypeError, match="parameters: got list, expected a mapping from names to values"):
+            call([0.5])

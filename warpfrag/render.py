@@ -5,7 +5,7 @@ from typing import Any, Unpack
 
 from warpfrag.arrays.devices import check_device
 from warpfrag.arrays.kinds import kind_of
-from warpfrag.arrays.warp_calls import call_with_warp
+from warpfrag.arrays.warp_calls import call_with_warp, named_values
 from warpfrag.capture.batch import check_views
 from warpfrag.renderer import Output, Renderer, check_outputs, joined
 from warpfrag.resolving import ResolveMethod, Resolving
@@ -87,9 +87,7 @@ def render(
     views, several = check_views(scene, camera)
     wanted, method = check_outputs(output), ResolveMethod.of(scene, resolving)
     options = {"samples": samples, "background": background, "bounds": bounds, "memory_limit": memory_limit}
-    values = dict(parameters or {})
-    if method.beta is not None:
-        values[BETA.key] = method.beta
+    values = named_values(parameters, beta=method.beta)
 
     def draw(given: Mapping[str, Any], place: str | None) -> dict[str, Any]:
         results = []

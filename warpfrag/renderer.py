@@ -9,7 +9,7 @@ import warp as wp
 
 from warpfrag.arrays.devices import check_device
 from warpfrag.arrays.kinds import common_kind, dtype_name, kind_of
-from warpfrag.arrays.warp_calls import call_with_warp
+from warpfrag.arrays.warp_calls import call_with_warp, named_values
 from warpfrag.capture.bounded import kbuffer_of_surfaces
 from warpfrag.capture.coverage import Coverage, store_coverage
 from warpfrag.capture.foremost import foremost, foremost_normals
@@ -131,15 +131,13 @@ class Renderer:
             with surfaces.in_order():
                 return surfaces.given(self._seen(surfaces).shade_surfaces(surfaces, moved=False))
 
-        return call_with_warp(shade, parameters or {}, self.scene.value_shapes(), self.device)
+        return call_with_warp(shade, named_values(parameters), self.scene.value_shapes(), self.device)
 
     def image(self, parameters: Mapping[str, Any] | None = None, output: Output | Sequence[Output] = "color") -> Any:
         """Return the image for parameter values; see `render`, also for other outputs and for what is raised."""
         wanted = check_outputs(output)
-        values = dict(parameters or {})
-        if self.method.beta is not None:
-            # As a parameter it has its say in the kind and precision of the image.
-            values[BETA.key] = self.method.beta
+        # As a parameter beta has its say in the kind and precision of the image.
+        values = named_values(parameters, beta=self.method.beta)
 
         def draw(given: Mapping[str, Any], device: str | None) -> Any:
             return self.draw(given, wanted, device)

@@ -17,6 +17,17 @@ from warpfrag.errors import shorten
 from warpfrag.extras import need
 
 
+def named_values(parameters: Mapping[str, Any] | None, **own: Any) -> dict[str, Any]:
+    """Return parameter values by name; those in `own` that are not None come before them.
+
+    Raises:
+        TypeError: they are no mapping.
+    """
+    if parameters is not None and not isinstance(parameters, Mapping):
+        raise TypeError(f"parameters: got {type(parameters).__name__}, expected a mapping from names to values")
+    return {**(parameters or {}), **{name: value for name, value in own.items() if value is not None}}
+
+
 def call_with_warp(
     function: Callable[[Mapping[str, Any], str | None], Any],
     values: Mapping[str, Any],

@@ -24,7 +24,7 @@ from warpfrag.arrays.devices import check_device
 from warpfrag.arrays.kinds import WARP, dtype_name, kind_of
 from warpfrag.arrays.launch import Span, launch
 from warpfrag.arrays.precisions import kernels
-from warpfrag.arrays.warp_calls import call_with_warp
+from warpfrag.arrays.warp_calls import call_with_warp, named_values
 from warpfrag.capture.batch import check_views, stack_fragments
 from warpfrag.capture.corner_gradients import ShadedGradients, fragment_adjoint, load_corners
 from warpfrag.capture.memory import Budget, CaptureSizes
@@ -316,7 +316,7 @@ def capture(
                 found.append(surfaces.given(coverage.shade_surfaces(surfaces, moved=False)))
         return stack_fragments(found) if several else found[0]
 
-    return call_with_warp(shade, parameters or {}, scene.value_shapes(), check_device(device))
+    return call_with_warp(shade, named_values(parameters), scene.value_shapes(), check_device(device))
 
 
 def _check_rows(rows: Any, camera: Camera) -> tuple[int, int]:
