@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import warp as wp
 from capture_scenes import orthographic, perspective, quad, scene, soup, surface
 
 from warpfrag.capture import memory
@@ -118,7 +117,7 @@ def test_bands_have_the_same_pixels(monkeypatch):
         bands.append(memory.split_rows(*arguments))
         return bands[-1]
 
-    monkeypatch.setattr(sys.modules[render.__module__], "split_rows", split_rows)
+    monkeypatch.setattr(sys.modules[Renderer.__module__], "split_rows", split_rows)
     whole = render(setting, beta=beta)
     assert not bands
     for limit in limits(setting):
@@ -290,5 +289,28 @@ def test_renderers_arguments_are_checked():
         Renderer(crowd(), resolve="sort")
     with pytest.raises(ValueError, match='merge: got "smooth", expected "none" or "order_independent"'):
         Renderer(crowd(), resolve="kbuffer")
-    with pytest.raises(TypeError, match=r"beta: got a wp\.array"):
-        Renderer(crowd()).image({"beta": wp.zeros(1, device="cpu")})
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_autocast_and_matmul_precision_move_nothing(dtype):
+    """Inside of `torch.autocast`, with fast matrix products allowed, image and gradients keep their bits."""
+    setting = crowd()
+    names = ["soup.vertices", "soup.opacity", "more.rotation", "camera.translation", "camera.fov", "beta"]
+
+    def run():
+        own = setting.parameters()
+        values = {name: torch.tensor(np.asarray(own[name]), dtype=torch.float32, requires_grad=True) for name in names}
+        image = render(setting, parameters=values, samples=2)
+        return [image, *torch.autograd.grad(image.square().sum(), list(values.values()))]
+
+    expected = run()
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("high")
+    try:
+        with torch.autocast("cpu", dtype=dtype):
+            found = run()
+    finally:
+        torch.set_float32_matmul_precision(before)
+    for one, other in zip(found, expected, strict=True):
+        assert one.dtype == other.dtype
+        assert torch.equal(one, other)

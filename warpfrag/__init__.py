@@ -24,14 +24,17 @@ if TYPE_CHECKING:
     from warpfrag.deep import concat, holdout
     from warpfrag.errors import SceneError
     from warpfrag.files.deep_exr import read_deep, write_deep
-    from warpfrag.files.images import read_image, write_image
+    from warpfrag.files.images import ImageError, read_image, write_image
     from warpfrag.files.scene_file import load_scene
     from warpfrag.fit import FitError, FitParameter, FitResult, Reference, Study, StudyError, View, fit, load_study
+    from warpfrag.fit.session import Progress
     from warpfrag.fragments import Fragments, Layers
-    from warpfrag.render import Renderer, render
+    from warpfrag.render import render
+    from warpfrag.renderer import Renderer
     from warpfrag.resolve.resolve import resolve
     from warpfrag.scene.camera import Camera
     from warpfrag.scene.depth_resolution import z_resolution
+    from warpfrag.scene.light import Light
     from warpfrag.scene.scene import Scene
     from warpfrag.scene.surface import SceneObject
     from warpfrag.storage.kbuffer import kbuffer
@@ -46,9 +49,12 @@ _HOMES = {
     "FitParameter": "fit",
     "FitResult": "fit",
     "Fragments": "fragments",
+    "ImageError": "files.images",
     "Layers": "fragments",
+    "Light": "scene.light",
+    "Progress": "fit.session",
     "Reference": "fit",
-    "Renderer": "render",
+    "Renderer": "renderer",
     "Scene": "scene.scene",
     "SceneError": "errors",
     "SceneObject": "scene.surface",
@@ -83,7 +89,10 @@ __all__ = [
     "FitParameter",
     "FitResult",
     "Fragments",
+    "ImageError",
     "Layers",
+    "Light",
+    "Progress",
     "Reference",
     "Renderer",
     "Scene",

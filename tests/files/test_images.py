@@ -282,3 +282,14 @@ def test_deep_openexr_files_are_named(tmp_path):
         ImageError, match=r"a.exr: got a deep image, whose pixels have several samples, expected a flat"
     ):
         read_image(tmp_path / "a.exr")
+
+
+def test_images_of_any_kind_are_written(tmp_path):
+    """Torch tensors, also those with a gradient, and Warp arrays are written as NumPy arrays are."""
+    import torch
+    import warp as wp
+
+    image = np.random.default_rng(0).uniform(0, 1, (3, 5, 4)).astype(np.float32)
+    for kind in (image, torch.tensor(image, requires_grad=True), wp.array(image, device="cpu")):
+        write_image(tmp_path / "a.npy", kind)
+        np.testing.assert_array_equal(np.load(tmp_path / "a.npy"), image)

@@ -73,3 +73,10 @@ def test_objects_compare_copy_and_pickle():
     assert one != replace(one, color=(1, 0, 0))
     assert one != "square"
     assert repr(one) == "SceneObject('square', 4 vertices, 2 faces)"
+
+
+def test_arrays_with_a_gradient_are_sent_to_parameters():
+    """A tensor that is to be differentiated is refused with the way that it is done."""
+    torch = pytest.importorskip("torch")
+    with pytest.raises(ValueError, match=r"m\.vertices: got Parameter of shape \(3, 3\), .*given as `parameters`"):
+        SceneObject("m", torch.nn.Parameter(torch.zeros(3, 3)), [[0, 1, 2]])

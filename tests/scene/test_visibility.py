@@ -31,8 +31,10 @@ def seen_from(**changes) -> Scene:
 def test_empty_images_are_named(changes, words):
     """As a warning when it is rendered, and among the notes of a fit."""
     scene = seen_from(**changes)
-    with pytest.warns(EmptyImageWarning, match=words):
+    with pytest.warns(EmptyImageWarning, match=words) as told:
         assert not render(scene).any()
+    # It points to the line that asked for the image.
+    assert told[0].filename == __file__
     assert why_empty(Scene(scene.camera)) == "the scene has no triangles"
     with pytest.warns(EmptyImageWarning, match=words):
         result = fit(Study(scene, Reference(true={}), {"red.opacity": 0.3}))

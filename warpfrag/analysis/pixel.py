@@ -125,13 +125,14 @@ class Inspection:
         return begin - margin, end + margin
 
 
-def inspect_pixel(scene: Scene, column: int, row: int) -> Inspection:
+def inspect_pixel(scene: Scene, column: int, row: int, device: str | None = None) -> Inspection:
     """Capture one pixel of a scene, and resolve it as the scene says.
 
     Args:
         scene: what to look at; its camera, beta, layers, merge and mix count.
         column: column of the pixel, from the left, 0 first.
         row: row of the pixel, from the top, 0 first.
+        device: where to capture it; default "cpu".
 
     Raises:
         ValueError: the image has no such pixel.
@@ -139,7 +140,7 @@ def inspect_pixel(scene: Scene, column: int, row: int) -> Inspection:
     height, width = scene.camera.shape
     if not (0 <= column < width and 0 <= row < height):
         raise ValueError(f"pixel: got {column},{row}, expected a column below {width} and a row below {height}")
-    captured = capture(scene, rows=(row, row + 1))
+    captured = capture(scene, rows=(row, row + 1), device=device)
     every = absorbance(captured, (0, column), scene.beta, mix=scene.mix)
     merged = absorbance(captured, (0, column), scene.beta, merge=scene.merge, max_layers=scene.layers, mix=scene.mix)
     return Inspection(scene, column, row, fragments_of_pixel(captured, (0, column)), every, merged)

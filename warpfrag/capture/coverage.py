@@ -11,7 +11,7 @@ whose gradient `capture` gives: near the parameters at which coverage was found 
 or changes its place in the order.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
@@ -20,9 +20,12 @@ import numpy as np
 import warp as wp
 
 from warpfrag.arrays.apply import apply
+from warpfrag.arrays.devices import check_device
 from warpfrag.arrays.kinds import WARP, dtype_name, kind_of
 from warpfrag.arrays.launch import Span, launch
 from warpfrag.arrays.precisions import kernels
+from warpfrag.arrays.warp_calls import call_with_warp, named_values
+from warpfrag.capture.batch import check_views, stack_fragments
 from warpfrag.capture.corner_gradients import ShadedGradients, fragment_adjoint, load_corners
 from warpfrag.capture.memory import Budget, CaptureSizes
 from warpfrag.capture.shade import SHADE, shaded_gradients
@@ -253,13 +256,14 @@ def store_coverage(
 
 def capture(
     scene: Scene,
-    camera: Camera | None = None,
+    camera: Camera | Sequence[Camera] | None = None,
     sort: bool = True,
     *,
     parameters: Mapping[str, Any] | None = None,
     rows: tuple[int, int] | None = None,
     bounds: Bounds = "clamp",
     memory_limit: float | None = None,
+    device: Any = None,
 ) -> Fragments:
     """Capture every surface that a pixel's ray meets as a fragment (the dynamic fragment buffer).
 
@@ -271,19 +275,22 @@ def capture(
 
     Args:
         scene: what to capture.
-        camera: where from; default the scene's.
+        camera: where from; default the scene's. Several, of one size, give fragments of shape (N, H, W).
         sort: order of a pixel's fragments: by (depth, object, primitive), or as submitted, by (object, primitive).
-        parameters: values in place of the scene's own, by the names of `scene.parameters()`: numbers, NumPy arrays, or
-            torch tensors, in which the fragments are then differentiable. `"thickness"` is that of all objects without
-            a value of their own here. `"beta"` is not used here.
+        parameters: values in place of the scene's own, by the names of `scene.parameters()`: numbers, NumPy arrays,
+            torch tensors or Warp arrays, in which the fragments are then differentiable (Warp arrays on an active tape,
+            which takes torch). `"thickness"` is that of all objects without a value of their own here. `"beta"` is not
+            used here.
         rows: capture only these rows [begin, end) of the image; default all.
         bounds: what becomes of parameters out of their range: "clamp" puts them on its end, with a gradient that leads
             back in but not farther out; "error" refuses them.
         memory_limit: most memory that fragments and their gradients may take [bytes]; default half of what is free.
+        device: where to compute, "cpu", "cuda" or "cuda:<number>"; default that of the arrays among the parameters, or
+            else "cpu".
 
     Returns:
-        Fragments of shape (H, W), or (end - begin, W), with object and primitive ids; torch tensors if any parameter is
-        one, else NumPy arrays; float64 if any parameter is an array of that, else float32.
+        Fragments of shape (H, W), or (end - begin, W), with object and primitive ids; torch tensors or Warp arrays if
+        any parameter is one, else NumPy arrays; float64 if any parameter is an array of that, else float32.
 
     Raises:
         TypeError: an argument is of the wrong type.
@@ -294,15 +301,22 @@ def capture(
         >>> wf.capture(wf.load_scene("scenes/three_spheres.toml")).shape
         (512, 512)
     """
-    camera = check_scene(scene, camera)
-    checked_rows = _check_rows(rows, camera)
-    surfaces = surfaces_of(scene, camera, parameters, bounds=bounds)
-    window = Window.of(surfaces.camera, checked_rows)
-    with surfaces.in_order():
-        coverage = find_coverage(scene, surfaces.camera, surfaces, window, sort=sort, memory_limit=memory_limit)
-        if rows is None:
-            warn_if_empty(coverage.count, scene, camera)
-        return coverage.shade_surfaces(surfaces, moved=False)
+    views, several = check_views(scene, camera)
+    checked_rows = _check_rows(rows, views[0])
+
+    def shade(values: Mapping[str, Any], place: str | None) -> Fragments:
+        found = []
+        for view in views:
+            surfaces = surfaces_of(scene, view, values, bounds=bounds, device=place)
+            window = Window.of(surfaces.camera, checked_rows)
+            with surfaces.in_order():
+                coverage = find_coverage(scene, surfaces.camera, surfaces, window, sort=sort, memory_limit=memory_limit)
+                if rows is None:
+                    warn_if_empty(coverage.count, scene, view)
+                found.append(surfaces.given(coverage.shade_surfaces(surfaces, moved=False)))
+        return stack_fragments(found) if several else found[0]
+
+    return call_with_warp(shade, named_values(parameters), scene.value_shapes(), check_device(device))
 
 
 def _check_rows(rows: Any, camera: Camera) -> tuple[int, int]:

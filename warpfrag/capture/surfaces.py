@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpfrag.arrays.kinds import Kind, as_vectors, dtype_name, kind_of
+from warpfrag.arrays.kinds import NUMPY, WARP, Kind, as_vectors, dtype_name, kind_of
 from warpfrag.arrays.precisions import Array, Array2, Number, Vector3, Vector4, in_precisions
 from warpfrag.raster.ray import Rays, Window
 from warpfrag.raster.triangles import RasterTriangles, prepare_triangles
@@ -181,6 +181,12 @@ class CameraSurfaces:
         """Return the triangles as rasterising takes them."""
         return prepare_triangles(self.kind.to_warp(self.points), self.tables.faces, window)
 
+    def given(self, result: Any) -> Any:
+        """Return arrays made of these, or fragments or layers, as they are given away: Warp arrays become NumPy's."""
+        if self.kind is not WARP:
+            return result
+        return result.numpy()
+
     def in_order(self) -> AbstractContextManager[Any]:
         """Return a context in which kernels run in order with the array library's own work on the device."""
         return self.kind.in_order(self.points)
@@ -202,17 +208,31 @@ def surfaces_of(
     tables: SurfaceTables | None = None,
     *,
     bounds: Bounds = "clamp",
+    device: str | None = None,
 ) -> CameraSurfaces:
     """Return a scene's surfaces for parameter values; `tables` are those of the scene, if there are any yet."""
-    return place_surfaces(assemble(scene, parameters, camera=camera, bounds=bounds), tables)
+    return place_surfaces(assemble(scene, parameters, camera=camera, bounds=bounds), tables, device)
 
 
-def place_surfaces(geometry: Geometry, tables: SurfaceTables | None = None) -> CameraSurfaces:
-    """Take a scene's geometry from world to camera space, and its tables to the device of its arrays."""
+def place_surfaces(
+    geometry: Geometry, tables: SurfaceTables | None = None, device_name: str | None = None
+) -> CameraSurfaces:
+    """Take a scene's geometry from world to camera space, and its tables to the device of its arrays.
+
+    Args:
+        geometry: the scene's.
+        tables: those of the scene, if there are any yet.
+        device_name: where surfaces are to be; None for where the arrays are. NumPy's go there as Warp arrays.
+
+    Raises:
+        ValueError: the arrays are on another device.
+    """
     kind, camera = kind_of(geometry.rgba), geometry.camera
     assert kind is not None
     place = kind.device_of(geometry.rgba)
-    device = wp.get_device("cpu" if place is None else str(place))
+    device = wp.get_device(str(place or device_name or "cpu"))
+    if device_name is not None and wp.get_device(device_name) != device:
+        raise ValueError(f'device: got "{device_name}", expected {place} like the parameters')
     if tables is None or tables.device != device:
         tables = SurfaceTables.of(geometry, device)
     distinct: list[Any] = []
@@ -226,15 +246,17 @@ def place_surfaces(geometry: Geometry, tables: SurfaceTables | None = None) -> C
     maps = None
     if distinct:
         maps = kind.xp.stack(distinct).reshape((len(distinct), camera.shape[0] * camera.shape[1]))
-    return CameraSurfaces(
-        to_camera_space(geometry.vertices, camera, geometry.camera_pose, geometry.precision, geometry.lens),
-        geometry.rgba,
-        geometry.thickness,
-        maps,
-        tables.objects(map_rows),
-        tables,
-        camera,
-    )
+    points = to_camera_space(geometry.vertices, camera, geometry.camera_pose, geometry.precision, geometry.lens)
+    rgba, thickness = geometry.rgba, geometry.thickness
+    if kind is NUMPY and not is_host(device):
+        points, rgba, thickness = (wp.array(array, device=device) for array in (points, rgba, thickness))
+        maps = None if maps is None else wp.array(maps, device=device)
+    return CameraSurfaces(points, rgba, thickness, maps, tables.objects(map_rows), tables, camera)
+
+
+def is_host(device: wp.Device) -> bool:
+    """Tell whether NumPy's arrays are on a device."""
+    return device.is_cpu
 
 
 def to_camera_space(

@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from warpfrag.cli.options import ParametersOption, SizeOption, UsageError, VerboseOption, parse_size, parse_whole
+from warpfrag.cli.options import (
+    DeviceOption,
+    ParametersOption,
+    SizeOption,
+    UsageError,
+    VerboseOption,
+    parse_device,
+    parse_size,
+    parse_whole,
+)
 from warpfrag.cli.streams import complain, start_warp
 from warpfrag.cli.studies import run_studies
 
@@ -45,6 +54,7 @@ def fit(
     tensorboard: Annotated[
         bool, typer.Option("--tensorboard", help="Log each step to the folder tensorboard in that of the results.")
     ] = False,
+    device: DeviceOption = None,
     verbose: VerboseOption = False,
 ) -> None:
     """Fit the parameters of a scene to an image; write images, plots, result.json and a checkpoint to a folder.
@@ -58,7 +68,7 @@ def fit(
     if source is not None and not every:
         raise UsageError("--from: got it without --all, expected both")
     options: dict[str, Any] = {"--resume": resume, "--steps": steps, "--size": size}
-    options |= {"--parameters": parameters, "--tensorboard": tensorboard}
+    options |= {"--parameters": parameters, "--tensorboard": tensorboard, "--device": device}
     if study is None or Path(study).is_dir():
         for option, value in options.items():
             if value not in (None, False):
@@ -66,7 +76,7 @@ def fit(
         run_studies(None if study is None else Path(study), source, output)
         return
     start_warp(verbose)
-    wanted = _read_study(study, size, steps, parameters)
+    wanted = _read_study(study, size, steps, parameters, parse_device(device))
     folder = output if output is not None else Path("results") / wanted.name
     again = _command(study, output, options)
     result = _run(wanted, folder, again, resume=resume, tensorboard=tensorboard)
@@ -76,12 +86,12 @@ def fit(
         print(f"results in {folder}")
 
 
-def _read_study(path: str, size: str | None, steps: str | None, parameters: Path | None) -> "Study":
+def _read_study(path: str, size: str | None, steps: str | None, parameters: Path | None, device: str | None) -> "Study":
     from warpfrag.files.examples import example_path
     from warpfrag.files.result_file import read_found
     from warpfrag.fit import load_study
 
-    study = load_study(example_path(path), size=None if size is None else parse_size(size))
+    study = load_study(example_path(path), size=None if size is None else parse_size(size), device=device)
     if steps is not None:
         study = replace(study, steps=parse_whole("--steps", steps, 1))
     if parameters is not None:

@@ -26,7 +26,7 @@ def flatten(
     from warpfrag.composite import composite
     from warpfrag.files.deep_exr import read_deep
     from warpfrag.files.images import check_target, write_image
-    from warpfrag.render import over_background
+    from warpfrag.samples import over_background
 
     check_target(output, bits=bits)
     number = 0.0 if beta is None else parse_number("--beta", beta, 0.0, 1.0)

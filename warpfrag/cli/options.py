@@ -33,6 +33,12 @@ SetOption = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="NAME=VALUE", help="Any parameter, such as ball.opacity=0.5; may be repeated."),
 ]
+ResolveOption = Annotated[
+    str | None, typer.Option("--resolve", help="sorted, or kbuffer: as submitted, into as many slots as layers.")
+]
+DeviceOption = Annotated[
+    str | None, typer.Option("--device", metavar="DEVICE", help="Where to compute: cpu, cuda or cuda:NUMBER [cpu].")
+]
 ParametersOption = Annotated[
     Path | None, typer.Option("--parameters", metavar="FILE", help="The result.json of a fit, whose values to take.")
 ]
@@ -95,6 +101,16 @@ def parse_whole(option: str, text: str, low: int) -> int:
     if not (digits.isascii() and digits.isdecimal() and len(digits) < 11 and low <= int(digits) < 2**31):
         raise UsageError(f"{option}: got {_shown(text)}, expected {range_wording(low, whole=True)}")
     return int(digits)
+
+
+def parse_device(text: str | None) -> str | None:
+    """Read the name of a device of this machine; None stays. Warp must have been started."""
+    from warpfrag.arrays.devices import check_device
+
+    try:
+        return check_device(text)
+    except ValueError as error:
+        raise UsageError(f"--{error}") from None
 
 
 def parse_size(text: str) -> tuple[int, int]:

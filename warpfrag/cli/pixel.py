@@ -8,6 +8,7 @@ import typer
 
 from warpfrag.cli.options import (
     BetaOption,
+    DeviceOption,
     LayersOption,
     MergeOption,
     MixOption,
@@ -17,6 +18,7 @@ from warpfrag.cli.options import (
     SizeOption,
     UsageError,
     VerboseOption,
+    parse_device,
     read_scene,
 )
 from warpfrag.cli.streams import start_warp
@@ -38,6 +40,7 @@ def inspect(
     size: SizeOption = None,
     parameters: ParametersOption = None,
     settings: SetOption = None,
+    device: DeviceOption = None,
     verbose: VerboseOption = False,
 ) -> None:
     """List the fragments of one pixel, and draw them with the absorbance along its ray, before and after merging."""
@@ -54,8 +57,9 @@ def inspect(
     if target.suffix.lower() != ".png":
         raise UsageError(f"{target}: got the suffix {target.suffix or '(none)'}, expected .png")
     check_target(target)
+    place = parse_device(device)
     wanted = read_scene(scene, parameters, settings, beta=beta, layers=layers, merge=merge, mix=mix, size=size)
-    inspection = inspect_pixel(wanted, column, row)
+    inspection = inspect_pixel(wanted, column, row, place)
     inspection.draw(target)
     for line in inspection.lines():
         print(line)

@@ -8,20 +8,28 @@ import typer
 
 from warpfrag.cli.options import (
     BetaOption,
+    DeviceOption,
     LayersOption,
     MergeOption,
     MixOption,
     ParametersOption,
+    ResolveOption,
     SceneArgument,
     SetOption,
     SizeOption,
     UsageError,
     VerboseOption,
     parse_background,
+    parse_device,
+    parse_whole,
     read_scene,
     with_thickness,
 )
 from warpfrag.cli.streams import start_warp
+from warpfrag.errors import check_choice
+
+# What an image file holds of what `render` gives.
+SHOWN = ("color", "depth", "normal", "object_id", "count")
 
 
 def render(
@@ -37,7 +45,14 @@ def render(
     layers: LayersOption = None,
     merge: MergeOption = None,
     mix: MixOption = None,
+    resolve: ResolveOption = None,
     size: SizeOption = None,
+    samples: Annotated[
+        str, typer.Option("--samples", metavar="NUMBER", help="Samples along each edge of a pixel (box filter).")
+    ] = "1",
+    show: Annotated[
+        str, typer.Option("--show", metavar="OUTPUT", help="color, depth, normal, object_id or count (of layers).")
+    ] = "color",
     bits: Annotated[int, typer.Option(help="Bits per channel of a PNG file, 8 or 16.")] = 8,
     background: Annotated[
         str | None, typer.Option(metavar="COLOR", help='"#rrggbb[aa]" (sRGB), "r,g,b[,a]" (linear) or none.')
@@ -45,23 +60,34 @@ def render(
     deep: Annotated[bool, typer.Option("--deep", help="Write all fragments: a deep .exr file.")] = False,
     parameters: ParametersOption = None,
     settings: SetOption = None,
+    device: DeviceOption = None,
     verbose: VerboseOption = False,
 ) -> None:
-    """Render a scene to an image: PNG (sRGB), OpenEXR or .npy (linear, premultiplied) by suffix; deep to .deep.exr."""
+    """Render a scene to an image: PNG (sRGB), OpenEXR or .npy (linear, premultiplied) by suffix; deep to .deep.exr.
+
+    With --show depth, normal, object_id or count OpenEXR and .npy hold the values themselves, and a PNG shows them as
+    grey levels or colours, whose range is told.
+    """
     start_warp(verbose)
     from warpfrag.capture.coverage import capture
     from warpfrag.files.deep_exr import check_deep_target, write_deep
     from warpfrag.files.images import check_target, write_image
+    from warpfrag.files.value_images import write_values
     from warpfrag.render import render as render_scene
 
     deep = deep or output.name.lower().endswith(".deep.exr")
     if deep:
         check_deep_target(output)
-        options = {"beta": beta, "layers": layers, "merge": merge, "mix": mix, "background": background}
-        for name in (name for name, value in options.items() if value is not None):
+        given = {"beta": beta, "layers": layers, "merge": merge, "mix": mix, "background": background}
+        given |= {"resolve": resolve, "samples": None if samples == "1" else samples}
+        given["show"] = None if show == "color" else show
+        for name in (name for name, value in given.items() if value is not None):
             raise UsageError(f"--{name}: got it with a deep image, expected it with a flat one, which is composited")
     else:
         check_target(output, bits=bits)
+    check_choice("--show", show, SHOWN, UsageError)
+    options = {"samples": parse_whole("--samples", samples, 1), "resolve": resolve}
+    on = parse_device(device)
     wanted = read_scene(scene, parameters, settings, beta=beta, layers=layers, merge=merge, mix=mix, size=size)
     if thickness is not None:
         wanted = replace(wanted, objects=[with_thickness(item, thickness) for item in wanted.objects])
@@ -69,9 +95,9 @@ def render(
         wanted = replace(wanted, background=parse_background(background))
     try:
         if deep:
-            fragments = capture(wanted)
+            fragments = capture(wanted, device=on)
         else:
-            image = render_scene(wanted)
+            image = render_scene(wanted, output=show, device=on, **options)  # type: ignore[arg-type]
     except (RuntimeError, MemoryError) as error:
         # Warp says how many bytes it lacks, not what for.
         if isinstance(error, MemoryError) or "allocate" in str(error):
@@ -80,5 +106,7 @@ def render(
         raise
     if deep:
         write_deep(output, fragments)
-    else:
+    elif show == "color":
         write_image(output, image, bits=bits)
+    elif told := write_values(output, show, image, bits=bits):
+        print(told)

@@ -59,10 +59,14 @@ def read_exr(path: Path) -> np.ndarray:
 
 def write_exr(path: Path, pixels: np.ndarray) -> None:
     """Write linear premultiplied RGB or RGBA, (H, W, 3 or 4) float32."""
+    write_channels(path, {"RGBA" if pixels.shape[2] == 4 else "RGB": pixels})
+
+
+def write_channels(path: Path, channels: dict[str, np.ndarray]) -> None:
+    """Write channels by name, (H, W) float32; "RGB" and "RGBA" are three and four of them, (H, W, 3 or 4)."""
     library = openexr()
     header = {"compression": library.ZIP_COMPRESSION, "type": library.scanlineimage}
-    name = "RGBA" if pixels.shape[2] == 4 else "RGB"
-    with library.File(header, {name: np.ascontiguousarray(pixels)}) as file:
+    with library.File(header, {name: np.ascontiguousarray(pixels) for name, pixels in channels.items()}) as file:
         file.write(str(path))
 
 

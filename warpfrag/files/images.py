@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from warpfrag.arrays.kinds import kind_of
 from warpfrag.colors import encode
 from warpfrag.files.exr import openexr, read_exr, write_exr
 from warpfrag.files.pixels import check_pixels, decode_image, with_opacity
@@ -87,7 +88,8 @@ def write_image(path: str | os.PathLike, image: Any, *, bits: int = 8) -> None:
 
     Args:
         path: a name that ends in `.png`, `.exr` or `.npy`, in a folder that exists.
-        image: linear premultiplied colour and opacity, (H, W, 4), or colour alone, (H, W, 3).
+        image: linear premultiplied colour and opacity, (H, W, 4), or colour alone, (H, W, 3): NumPy array, torch tensor
+            (with gradient or without) or Warp array.
         bits: bits per channel of a PNG file, 8 or 16.
 
     Raises:
@@ -96,7 +98,8 @@ def write_image(path: str | os.PathLike, image: Any, *, bits: int = 8) -> None:
     """
     path, name = Path(path), wording_of_path(path)
     check_target(path, bits=bits)
-    pixels = np.asarray(image)
+    kind = kind_of(image)
+    pixels = np.asarray(image if kind is None else kind.to_numpy(image))
     if pixels.ndim != 3 or pixels.shape[2] not in (3, 4) or pixels.size == 0:
         raise ImageError(f"{name}: got an image of shape {pixels.shape}, expected (H, W, 3) or (H, W, 4)")
     if not all(np.isfinite(band).all() for band in _bands(pixels)):

@@ -34,7 +34,7 @@ from warpfrag.scene.names import CAMERA
 from warpfrag.scene.parameters import multiple_of_p
 from warpfrag.scene.surface import SceneObject
 from warpfrag.shapes import primitives
-from warpfrag.shapes.mesh import GREY, Mesh, smooth_normals, split_faces
+from warpfrag.shapes.mesh import Mesh, looking, scene_object, smooth_normals, split_faces
 from warpfrag.shapes.surfels import surfels
 
 _OBJECT = ("name", *PLACEMENT_KEYS, "color", "opacity", "thickness", "texture", "normals")
@@ -172,22 +172,8 @@ def _scene_object(table: Table, name: str, mesh: Mesh, reading: _Reading, thickn
     # Discs of one surface overlap at angles to one another: the paper gives them more than its 2·P(z).
     default = "10P" if "points" in table else "2P"
     thickness, unit = _thickness(table, default if thickness_value is None else thickness_value)
-    color = np.full(3, 1.0 if mesh.textures else GREY) if mesh.color is None else mesh.color
     try:
-        return SceneObject(
-            name,
-            mesh.vertices,
-            mesh.faces,
-            matrix,
-            color,
-            1.0 if mesh.opacity is None else mesh.opacity,
-            thickness,
-            unit,
-            mesh.uv if mesh.textures else None,
-            (mesh.textures if mesh.texture_index is not None else mesh.textures[0]) if mesh.textures else None,
-            mesh.texture_index if mesh.textures else None,
-            normals=mesh.normals,
-        )
+        return scene_object(mesh, name, matrix, thickness, unit)
     except ValueError as error:
         raise table.prefixed("", error) from None
 
@@ -267,20 +253,9 @@ def _look(table: Table, mesh: Mesh) -> Mesh:
     if "texture" in table:
         if mesh.uv is None:
             raise table.error("texture", "a mesh without texture coordinates", "a mesh with them, or no texture")
-        mesh = replace(mesh, textures=[_image(table)], texture_index=None, color=None)
-        if opacity is not None:
-            mesh = replace(mesh, opacity=opacity)
-        return mesh if color is None else replace(mesh, color=np.array(color))
-    images = mesh.textures
-    if color is not None:
-        images = [np.concatenate([np.ones_like(image[..., :3]), image[..., 3:]], axis=-1) for image in images]
-        mesh = replace(mesh, color=np.array(color))
-    if opacity is not None:
-        images = [np.concatenate([image[..., :3], image[..., 3:] > 0.0], axis=-1) for image in images]
-        mesh = replace(mesh, opacity=opacity)
-    if color is not None and all(image.min() == 1.0 for image in images):
-        images = []
-    return replace(mesh, textures=images)
+        mesh = replace(mesh, textures=[_image(table)])
+        return looking(mesh, color, opacity, own_images=False)
+    return looking(mesh, color, opacity)
 
 
 def _image(table: Table) -> np.ndarray:

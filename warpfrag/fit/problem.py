@@ -20,7 +20,8 @@ from warpfrag.fit.scaled_fragments import UnitFragments
 from warpfrag.fit.study import PreparedStudy, Study
 from warpfrag.fit.views import Resolve, View
 from warpfrag.fragments import Fragments
-from warpfrag.render import Renderer, over_background
+from warpfrag.renderer import Renderer
+from warpfrag.samples import over_background
 from warpfrag.scene.parameters import BETA
 from warpfrag.storage.kbuffer import kbuffer
 

@@ -1,7 +1,6 @@
 """Studies: what is fitted to which images, and how. `study_file` reads them from TOML."""
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -10,6 +9,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 import warp as wp
 
+from warpfrag.arrays.devices import check_device
 from warpfrag.capture.memory import allowed_memory
 from warpfrag.errors import check_choice, check_number, check_whole, shorten
 from warpfrag.fit.losses import ImageLoss
@@ -137,24 +137,9 @@ class Study:
             check_number(key, getattr(self, key), above=0.0)
         for key in ("tolerance", "checkpoint_seconds"):
             check_number(key, getattr(self, key), 0.0)
-        check_device(self.device)
+        check_device(str(self.device))
         if not self.parameters:
             raise StudyError("parameters: got none, expected at least one to fit")
-
-
-def check_device(device: Any) -> None:
-    """Check that a device is one of this machine.
-
-    Raises:
-        StudyError: it is not.
-    """
-    match = re.fullmatch(r"cpu|cuda(?::(\d+))?", device) if isinstance(device, str) else None
-    if match is None:
-        raise StudyError(f'device: got {shorten(device)}, expected "cpu", "cuda" or "cuda:<number>"')
-    count = 0 if device == "cpu" else wp.get_cuda_device_count()
-    if device != "cpu" and int(match[1] or 0) >= count:
-        here = f"{count} CUDA devices" if count else "no CUDA device"
-        raise StudyError(f'device: got "{device}" on a machine with {here}, expected another, such as "cpu"')
 
 
 @dataclass(frozen=True, eq=False)

@@ -56,12 +56,13 @@ _TOP += (*_INTEGERS, *_NUMBERS, *RENDER_OPTIONS)
 _PARAMETER = ("start", "lower", "upper", "per", "learning_rate", "smoothness", "levels")
 
 
-def load_study(path: str | os.PathLike, *, size: tuple[int, int] | None = None) -> Study:
+def load_study(path: str | os.PathLike, *, size: tuple[int, int] | None = None, device: str | None = None) -> Study:
     """Read a study file, the scene it names and its reference images.
 
     Args:
         path: a TOML file.
         size: width and height in place of those in the files, of every view.
+        device: where to compute, in place of what the file says.
 
     Raises:
         StudyError: anything in it that cannot be used: file, key, what was got, what is expected.
@@ -82,7 +83,7 @@ def load_study(path: str | os.PathLike, *, size: tuple[int, int] | None = None) 
         values |= {key: top.integer(key, *span) for key, span in _INTEGERS.items()}
         values |= {key: top.number(key, 0.0) for key in _NUMBERS}
         values["loss"] = top.data.get("loss")
-        values["device"] = top.text("device")
+        values["device"] = device or top.text("device")
         views = _views(top, path, scene, size)
         reference = None
         if "reference" in top or not views or any(view.reference is None for view in views):

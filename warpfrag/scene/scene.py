@@ -33,6 +33,13 @@ class Scene:
     Raises:
         TypeError: a value of the wrong kind.
         ValueError: two objects of one name, one named "camera", or a value out of its range.
+
+    Example:
+        >>> ball = wf.shapes.sphere(0.5).object("ball", color=(0.9, 0.2, 0.1), opacity=0.5, thickness=0.1)
+        >>> floor = wf.shapes.plane((4, 4)).object("floor", rotate=(-90, 0, 0), translate=(0, -0.5, 0))
+        >>> camera = wf.Camera.look_at((0, 1, 3), (0, 0, 0), fov=45.0, size=(320, 240))
+        >>> wf.Scene(camera, [ball, floor], light=wf.Light((1, 2, 1)), background=(1, 1, 1, 1))
+        Scene(320 × 240, objects: ball, floor)
     """
 
     camera: Camera
@@ -96,6 +103,10 @@ class Scene:
     def parameter_names(self) -> set[str]:
         """Return all names that `parameters=` takes: those of `parameters()`, and `"thickness"` for all objects."""
         return set(self.described())
+
+    def value_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Return the shape of one value of each parameter, by name: () for a number."""
+        return {name: parameter.kind.value_shape for name, parameter in self.described().items()}
 
     def own_value(self, name: str) -> float | np.ndarray | None:
         """Return one parameter's value, as `parameters` does; None for a common thickness where objects differ.

@@ -179,7 +179,10 @@ class SceneObject:
         try:
             array = np.asarray(value)
         except (ValueError, TypeError, RuntimeError) as error:
-            raise ValueError(f"{self.name}.{key}: got {shorten(value)}, expected numbers") from error
+            expected = "numbers"
+            if getattr(value, "requires_grad", False):
+                expected = "numbers without a gradient (detach them; what is differentiated is given as `parameters`)"
+            raise ValueError(f"{self.name}.{key}: got {shorten(value)}, expected {expected}") from error
         self._fail_unless(array.dtype.kind in "fiu", key, shorten(value), "numbers")
         return array
 

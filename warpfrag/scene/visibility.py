@@ -1,5 +1,6 @@
 """Why an image shows nothing of a scene."""
 
+import inspect
 import warnings
 
 import numpy as np
@@ -41,4 +42,12 @@ def why_empty(scene: Scene, camera: Camera | None = None) -> str:
 def warn_if_empty(fragment_count: int, scene: Scene, camera: Camera | None = None) -> None:
     """Warn that an image shows nothing, unless there are fragments, or no triangles to see."""
     if fragment_count == 0 and any(len(item.faces) for item in scene.objects):
-        warnings.warn(why_empty(scene, camera), EmptyImageWarning, stacklevel=3)
+        warnings.warn(why_empty(scene, camera), EmptyImageWarning, stacklevel=_level_of_caller())
+
+
+def _level_of_caller() -> int:
+    """Return how many frames above the one that asks the first is that is not of this package."""
+    package, level, frame = __name__.partition(".")[0], 0, inspect.currentframe()
+    while frame is not None and frame.f_globals["__name__"].partition(".")[0] == package:
+        level, frame = level + 1, frame.f_back
+    return level

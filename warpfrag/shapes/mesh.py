@@ -5,13 +5,17 @@ from typing import Any
 
 import numpy as np
 
+from warpfrag.errors import check_number, shorten
 from warpfrag.scene.light import area_vectors, transformed_normals, unit_rows
+from warpfrag.scene.names import ThicknessUnit
+from warpfrag.scene.rotation import rotation_matrix
+from warpfrag.scene.surface import SceneObject
 
 # Of what says nothing about its colour, in linear light.
 GREY = 0.8
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Mesh:
     """Triangles and how they look, before a scene file has its say.
 
@@ -37,6 +41,116 @@ class Mesh:
     textures: list[np.ndarray] = field(default_factory=list)
     texture_index: np.ndarray | None = None
     name: str = ""
+
+    def __repr__(self) -> str:
+        return f"Mesh({len(self.vertices)} vertices, {len(self.faces)} faces)"
+
+    def object(
+        self,
+        name: str,
+        *,
+        color: Any = None,
+        opacity: Any = None,
+        thickness: Any = "2P",
+        texture: np.ndarray | None = None,
+        translate: Any = (0.0, 0.0, 0.0),
+        rotate: Any = (0.0, 0.0, 0.0),
+        scale: Any = 1.0,
+    ) -> SceneObject:
+        """Return this mesh as an object of a scene, scaled first, then turned, moved last.
+
+        Normals that it lacks are computed, smooth ones (see `split_faces` for flat ones).
+
+        Args:
+            name: unique in its scene.
+            color: straight linear RGB from 0, (3,) or per vertex (V, 3), in place of the mesh's colours and those of
+                its images; default those, or else grey.
+            opacity: 0 to 1, one number or per vertex (V,), in place of the mesh's, but what its images cut out (alpha
+                0) stays cut out; default that, or else 1.
+            thickness: z-thickness [scene units], or a text such as "2P", multiples of P(z).
+            texture: straight linear image, (h, w, 3) or (h, w, 4), row 0 at the top, which `color` tints; the mesh must
+                have texture coordinates (`uv=True` of round primitives).
+            translate: [scene units], 3 numbers.
+            rotate: rotation vector: along the axis, as long as the angle [degrees], 3 numbers.
+            scale: a number other than 0, or one for each axis.
+
+        Raises:
+            TypeError: a value of the wrong kind.
+            ValueError: a value of the wrong shape or out of its range.
+
+        Example:
+            >>> wf.shapes.cube().object("box", opacity=0.5, rotate=(0, 45, 0))
+            SceneObject('box', 24 vertices, 12 faces)
+        """
+        mesh = self if self.normals is not None else replace(self, normals=smooth_normals(self.vertices, self.faces))
+        if texture is not None:
+            mesh = replace(mesh, textures=[_with_opacity(name, texture)])
+        matrix = np.eye(4)
+        matrix[:3, :3] = rotation_matrix(np.array(_vector(name, "rotate", rotate)))
+        factors = [scale] * 3 if np.ndim(scale) == 0 else scale
+        matrix[:3, :3] = matrix[:3, :3] @ np.diag(_vector(name, "scale", factors))
+        matrix[:3, 3] = _vector(name, "translate", translate)
+        return scene_object(looking(mesh, color, opacity, own_images=texture is None), name, matrix, thickness)
+
+
+def looking(mesh: Mesh, color: Any, opacity: Any, *, own_images: bool = True) -> Mesh:
+    """Return a mesh with a colour and an opacity, where they are not None, in place of its own.
+
+    Args:
+        mesh: the mesh.
+        color: straight linear RGB, (3,) or (V, 3).
+        opacity: one number or (V,).
+        own_images: whether its images are its own, whose colours and opacity the new ones replace too; else they are
+            another, which the new ones tint. What an image cuts out (alpha 0) stays cut out.
+    """
+    images = mesh.textures
+    if not own_images:
+        mesh = replace(mesh, texture_index=None, color=color if color is None else np.asarray(color))
+        return mesh if opacity is None else replace(mesh, opacity=opacity)
+    if color is not None:
+        images = [np.concatenate([np.ones_like(image[..., :3]), image[..., 3:]], axis=-1) for image in images]
+        mesh = replace(mesh, color=np.asarray(color))
+    if opacity is not None:
+        images = [np.concatenate([image[..., :3], image[..., 3:] > 0.0], axis=-1) for image in images]
+        mesh = replace(mesh, opacity=opacity)
+    if color is not None and all(image.min() == 1.0 for image in images):
+        images = []
+    return replace(mesh, textures=images)
+
+
+def scene_object(
+    mesh: Mesh, name: str, matrix: np.ndarray, thickness: Any, unit: ThicknessUnit = "scene"
+) -> SceneObject:
+    """Return a mesh as an object: grey, or white under an image, where it has no colour of its own; opaque."""
+    color = np.full(3, 1.0 if mesh.textures else GREY) if mesh.color is None else mesh.color
+    return SceneObject(
+        name,
+        mesh.vertices,
+        mesh.faces,
+        matrix,
+        color,
+        1.0 if mesh.opacity is None else mesh.opacity,
+        thickness,
+        unit,
+        mesh.uv if mesh.textures else None,
+        (mesh.textures if mesh.texture_index is not None else mesh.textures[0]) if mesh.textures else None,
+        mesh.texture_index if mesh.textures else None,
+        normals=mesh.normals,
+    )
+
+
+def _vector(name: str, key: str, value: Any) -> list[float]:
+    if not isinstance(value, (list, tuple, np.ndarray)) or len(value) != 3:
+        raise ValueError(f"{name}.{key}: got {shorten(value)}, expected 3 numbers")
+    return [check_number(f"{name}.{key}", part) for part in value]
+
+
+def _with_opacity(name: str, image: Any) -> np.ndarray:
+    image = np.asarray(image, dtype=np.float32)
+    if image.ndim != 3 or image.shape[2] not in (3, 4):
+        raise ValueError(f"{name}.texture: got shape {image.shape}, expected shape (h, w, 3) or (h, w, 4)")
+    opaque = np.ones((*image.shape[:2], 1), np.float32)
+    return image if image.shape[2] == 4 else np.concatenate([image, opaque], axis=-1)
 
 
 def placed(mesh: Mesh, matrix: np.ndarray) -> Mesh:

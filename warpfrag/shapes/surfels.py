@@ -18,7 +18,7 @@ from warpfrag.shapes.mesh import Mesh
 NEIGHBOURS = 12
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class PointSet:
     """Points of a surface.
 
@@ -34,12 +34,15 @@ class PointSet:
     color: np.ndarray | None = None
     opacity: np.ndarray | None = None
 
+    def __repr__(self) -> str:
+        return f"PointSet({len(self.points)} points)"
 
-def surfels(points: PointSet, radius: float = 2.0, segments: int = 8) -> Mesh:
+
+def surfels(points: PointSet | np.ndarray, radius: float = 2.0, segments: int = 8) -> Mesh:
     """Build a disc for each point, perpendicular to its normal.
 
     Args:
-        points: the points.
+        points: the points, or their positions alone, (P, 3).
         radius: radius of the discs in multiples of the spacing, above 0. At 2 a surface of randomly scattered points
             has few holes.
         segments: corners of each disc, from 3.
@@ -52,9 +55,10 @@ def surfels(points: PointSet, radius: float = 2.0, segments: int = 8) -> Mesh:
         ImportError: scipy is missing.
 
     Example:
-        >>> surfels(PointSet(np.random.default_rng(0).random((100, 3))), segments=6).faces.shape
+        >>> surfels(np.random.default_rng(0).random((100, 3)), segments=6).faces.shape
         (400, 3)
     """
+    points = points if isinstance(points, PointSet) else PointSet(np.asarray(points, np.float64))
     normals = estimate_normals(points.points) if points.normals is None else points.normals
     size = radius * spacing(points.points)
     across, up = _tangents(normals)
