@@ -19,6 +19,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from warpfrag import baselines, shapes, storage
     from warpfrag.analysis.absorbance import Absorbance, absorbance
+    from warpfrag.analysis.coplanarity import Coplanarity, coplanarity
+    from warpfrag.analysis.csg import csg
     from warpfrag.capture.coverage import capture
     from warpfrag.composite import composite
     from warpfrag.errors import SceneError
@@ -40,6 +42,7 @@ __version__ = "0.1.0"
 _HOMES = {
     "Absorbance": "analysis.absorbance",
     "Camera": "scene.camera",
+    "Coplanarity": "analysis.coplanarity",
     "FitError": "fit",
     "FitParameter": "fit",
     "FitResult": "fit",
@@ -57,6 +60,8 @@ _HOMES = {
     "baselines": "",
     "capture": "capture.coverage",
     "composite": "composite",
+    "coplanarity": "analysis.coplanarity",
+    "csg": "analysis.csg",
     "fit": "fit",
     "kbuffer": "storage.kbuffer",
     "load_scene": "files.scene_file",
@@ -73,6 +78,7 @@ _HOMES = {
 __all__ = [
     "Absorbance",
     "Camera",
+    "Coplanarity",
     "FitError",
     "FitParameter",
     "FitResult",
@@ -90,6 +96,8 @@ __all__ = [
     "baselines",
     "capture",
     "composite",
+    "coplanarity",
+    "csg",
     "fit",
     "kbuffer",
     "load_scene",

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -22,6 +22,9 @@ from warpfrag.cli.options import (
 )
 from warpfrag.cli.streams import start_warp
 
+if TYPE_CHECKING:
+    from warpfrag.scene.scene import Scene
+
 
 def render(
     scene: SceneArgument,
@@ -35,6 +38,9 @@ def render(
     merge: MergeOption = None,
     mix: MixOption = None,
     size: SizeOption = None,
+    method: Annotated[
+        str | None, typer.Option(metavar="NAME", help="How to find fragments, such as f2b_2p; see warpfrag.storage.")
+    ] = None,
     bits: Annotated[int, typer.Option(help="Bits per channel of a PNG file, 8 or 16.")] = 8,
     background: Annotated[
         str | None, typer.Option(metavar="COLOR", help='"#rrggbb[aa]" (sRGB), "r,g,b[,a]" (linear) or none.')
@@ -55,7 +61,7 @@ def render(
     if background is not None:
         wanted = replace(wanted, background=parse_background(background))
     try:
-        image = render_scene(wanted)
+        image = render_scene(wanted) if method is None else _render_by(wanted, method)
     except (RuntimeError, MemoryError) as error:
         # Warp says how many bytes it lacks, not what for.
         if isinstance(error, MemoryError) or "allocate" in str(error):
@@ -63,3 +69,14 @@ def render(
             raise MemoryError(f"size: got {size} pixels, expected what fits into memory ({error})") from error
         raise
     write_image(output, image, bits=bits)
+
+
+def _render_by(scene: "Scene", method: str) -> Any:
+    """Return the image of the fragments that a method captures."""
+    from warpfrag.capture.coverage import capture
+    from warpfrag.composite import composite
+    from warpfrag.render import over_background
+
+    fragments = capture(scene, method=method)
+    image = composite(fragments, scene.beta, max_layers=scene.layers, merge=scene.merge, mix=scene.mix)
+    return over_background(image, scene.background)
