@@ -60,3 +60,10 @@ def rays_through(camera: Camera) -> np.ndarray:
     x = (np.arange(width) + 0.5 - width / 2) / camera.focal
     y = (np.arange(height) + 0.5 - height / 2) / camera.focal
     return np.stack([*np.meshgrid(x, y), np.ones((height, width))], -1)
+
+
+def stretch_of(camera: Camera) -> np.ndarray:
+    """Return how much longer a pixel's ray is than the planar depth that it reaches, (H, W)."""
+    height, width = camera.shape
+    x, y = np.meshgrid(np.arange(width) + 0.5 - 0.5 * width, np.arange(height) + 0.5 - 0.5 * height)
+    return np.sqrt(1.0 + (x**2 + y**2) / camera.focal**2)

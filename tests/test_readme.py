@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[1]
 EXAMPLES = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
 
 
-@pytest.mark.parametrize("example", EXAMPLES, ids=["torch", "warp", "numpy", "fit"])
+@pytest.mark.parametrize("example", EXAMPLES, ids=["torch", "warp", "numpy", "optimiser", "fit"])
 def test_example_runs(example):
     """Pasted into a file and run from the root of the project, an example prints its result."""
     run = subprocess.run([sys.executable, "-c", example], cwd=ROOT, capture_output=True, text=True, check=False)

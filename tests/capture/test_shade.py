@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from capture_scenes import orthographic, perspective, pixels_of, quad, rays_through, scene, soup, surface
+from capture_scenes import orthographic, perspective, pixels_of, quad, rays_through, scene, soup, stretch_of, surface
 
 from warpfrag.capture.coverage import capture
 from warpfrag.scene.camera import Camera
@@ -116,12 +116,14 @@ def test_thickness_map_is_taken_per_pixel():
 
 
 def test_thickness_in_multiples_of_depth_resolution():
-    """A thickness in the unit P is its factor times P(depth)."""
+    """A thickness in the unit P is its factor times P of the planar depth, seen along the ray."""
     camera = perspective((16, 10), near=0.1, far=50.0)
     factors = np.linspace(1, 3, 160).reshape(10, 16)
     objects = [quad(2.0, thickness=2.0, thickness_unit="P"), quad(3.0, name="b", thickness=factors, thickness_unit="P")]
     found = capture(scene(camera, *objects))
-    expected = z_resolution(found.depth, 0.1, 50.0).reshape(10, 16, 2) * np.stack([np.full((10, 16), 2.0), factors], -1)
+    along = stretch_of(camera)[..., None]
+    resolution = along * z_resolution(found.depth.reshape(10, 16, 2) / along, 0.1, 50.0)
+    expected = resolution * np.stack([np.full((10, 16), 2.0), factors], -1)
     np.testing.assert_allclose(found.thickness.reshape(10, 16, 2), expected, rtol=1e-6)
 
 
@@ -217,8 +219,11 @@ def test_gradients_of_thickness_maps_and_multiples_of_p():
     values = leaves(setting, "factor.thickness")
     found = capture(setting, parameters=values)
     (grad,) = torch.autograd.grad(found.thickness[found.object_id == 1].sum(), list(values.values()))
-    expected = z_resolution(found.depth[found.object_id == 1], 0.5, 4.0).sum()
-    torch.testing.assert_close(grad, expected.detach())
+    fragments = found.numpy()
+    own = fragments.object_id == 1
+    along = stretch_of(camera).reshape(-1)[fragments.pixel][own]
+    expected = (along * z_resolution(fragments.depth[own] / along, 0.5, 4.0)).sum()
+    np.testing.assert_allclose(float(grad), expected, rtol=1e-6)
 
 
 def test_large_triangle_in_strips():

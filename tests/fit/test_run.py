@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -27,7 +28,8 @@ def test_nan_in_the_loss_stops(method, monkeypatch):
             image.fill_(float("nan")) if hasattr(image, "fill_") else image.fill(np.nan)
         return image
 
-    monkeypatch.setattr(problem_module, "composite", poisoned)
+    for module in (problem_module, import_module("warpfrag.render")):
+        monkeypatch.setattr(module, "composite", poisoned)
     with pytest.raises(FitError, match=r"step \d+: the loss is nan at beta 0\.\d+, red\.thickness"):
         fit(make_study(method=method))
 

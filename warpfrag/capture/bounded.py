@@ -52,10 +52,11 @@ BAND_BYTES = 1 << 28
 
 @wp.struct
 class Place:
-    """Where the ray of a pixel meets a triangle: that one's corners, the `hit_weights`, and the depth along the ray."""
+    """Where the ray of a pixel meets a triangle: its corners, `hit_weights`, `stretch`, and the depth along the ray."""
 
     corner: wp.vec3i
     hit: wp.vec3d
+    along: wp.float64
     depth: wp.float64
 
 
@@ -69,7 +70,8 @@ def locate(surface: Any, pixel: int, face: int) -> Place:
     place = Place()
     place.corner = surface.corners[face]
     place.hit = hit_of(surface, place.corner, x, y)
-    place.depth = place.hit[2] * stretch(x, y, rays.scale, rays.perspective)
+    place.along = stretch(x, y, rays.scale, rays.perspective)
+    place.depth = place.hit[2] * place.along
     return place
 
 
@@ -77,7 +79,7 @@ def locate(surface: Any, pixel: int, face: int) -> Place:
 def front_of(surface: Any, pixel: int, face: int, place: Place, depth: Any):
     """Return the front of the fragment of a triangle."""
     item = surface.objects[surface.object_id[face]]
-    return depth - type(depth)(shade_thickness(surface, item, place.corner, place.hit, place.depth, pixel))
+    return depth - type(depth)(shade_thickness(surface, item, place.corner, place.hit, place.along, pixel))
 
 
 @wp.func(inline=True)

@@ -237,10 +237,10 @@ def fragment_adjoint(
         if triangle.in_p != 0:
             if triangle.map >= 0:
                 factor = map_thickness(surface, triangle.map, pixel)
-            depth = hit[2] * along
-            slope = depth_resolution_slope(depth, rays.near, rays.far, DEPTH_STEP, rays.perspective)
+            # t = factor P(z) along: by the distance z along, its derivative is factor P'(z).
+            slope = depth_resolution_slope(hit[2], rays.near, rays.far, DEPTH_STEP, rays.perspective)
             grad_depth += grad_own * factor * slope
-            grad_own *= thickness_scale(depth, triangle.in_p, rays)
+            grad_own *= thickness_scale(hit[2], along, triangle.in_p, rays)
         if triangle.map < 0:
             gradients.thickness_a = (ONE - l_b - l_c) * grad_own
             gradients.thickness_b = l_b * grad_own

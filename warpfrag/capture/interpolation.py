@@ -51,10 +51,10 @@ def premultiplied(l_b: wp.float64, l_c: wp.float64, a: wp.vec4d, b: wp.vec4d, c:
 
 
 @wp.func
-def thickness_scale(depth: wp.float64, in_p: int, rays: Rays) -> wp.float64:
-    """Return the unit of a thickness: 1, or P(depth)."""
+def thickness_scale(planar: wp.float64, along: wp.float64, in_p: int, rays: Rays) -> wp.float64:
+    """Return the unit of a thickness: 1, or P of the planar depth, which is `along` times as long along the ray."""
     if in_p != 0:
-        return depth_resolution(depth, rays.near, rays.far, DEPTH_STEP, rays.perspective)
+        return depth_resolution(planar, rays.near, rays.far, DEPTH_STEP, rays.perspective) * along
     return ONE
 
 
@@ -85,14 +85,14 @@ def map_thickness(surface: Any, row: int, pixel: int) -> wp.float64:
 
 @wp.func(inline=True)
 def shade_thickness(
-    surface: Any, item: wp.vec3i, corner: wp.vec3i, hit: wp.vec3d, depth: wp.float64, pixel: int
+    surface: Any, item: wp.vec3i, corner: wp.vec3i, hit: wp.vec3d, along: wp.float64, pixel: int
 ) -> wp.float64:
-    """Return a fragment's z-thickness, given its row in the table of objects, its triangle's corners and its depth."""
+    """Return a fragment's z-thickness, given its row in the table of objects, its triangle's corners and `stretch`."""
     own = mix3(
         wp.float64(surface.thickness[corner[0]]), wp.float64(surface.thickness[corner[1]]),
         wp.float64(surface.thickness[corner[2]]), hit[0], hit[1],
     )  # fmt: skip
     if item[OBJECT_MAP] >= 0:
         own = map_thickness(surface, item[OBJECT_MAP], pixel)
-    own *= thickness_scale(depth, item[OBJECT_IN_P], surface.rays)
+    own *= thickness_scale(hit[2], along, item[OBJECT_IN_P], surface.rays)
     return wp.max(own, ZERO)

@@ -86,7 +86,7 @@ def shade_fwd(number: Any) -> Any:
                 item = surface.objects[owner]
                 shaded.rgba[fragment] = vec4(shade_color(surface, face, corner, hit))
                 shaded.depth[fragment] = number(depth)
-                shaded.thickness[fragment] = number(shade_thickness(surface, item, corner, hit, depth, pixel))
+                shaded.thickness[fragment] = number(shade_thickness(surface, item, corner, hit, along, pixel))
                 shaded.object_id[fragment] = owner
                 shaded.primitive_id[fragment] = face - item[OBJECT_FIRST_FACE]
 
@@ -205,8 +205,8 @@ def maps_bwd(number: Any) -> Any:
                     item = surface.objects[surface.object_id[face]]
                     if item[OBJECT_MAP] == map_row:
                         hit = hit_of(surface, surface.corners[face], x, y)
-                        depth = hit[2] * stretch(x, y, rays.scale, rays.perspective)
-                        scale = thickness_scale(depth, item[OBJECT_IN_P], rays)
+                        along = stretch(x, y, rays.scale, rays.perspective)
+                        scale = thickness_scale(hit[2], along, item[OBJECT_IN_P], rays)
                         total += scale * wp.float64(grads.thickness[fragment])
                 grad_maps[map_row, rays.first_row * rays.width + pixel] = number(total)
 

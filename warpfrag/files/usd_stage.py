@@ -222,6 +222,11 @@ def _time(stage: Any) -> Any:
     return Usd.TimeCode.Default() if earliest is None else Usd.TimeCode(earliest)
 
 
+def told_of(reading: Reading) -> dict[str, Any]:
+    """Return what is told of a stage beside its arrays."""
+    return {"meshes": reading.meshes, "notes": reading.notes, "kinds": sorted(reading.kinds)}
+
+
 def main(words: list[str]) -> int:
     """Read a stage and write what it holds; the exit status is 0 if that was written."""
     path, root, output, most_bytes = Path(words[0]), Path(words[1]), words[2], int(words[3])
@@ -237,7 +242,7 @@ def main(words: list[str]) -> int:
     try:
         reading = read_stage(path, root)
         arrays = reading.arrays
-        told = {"meshes": reading.meshes, "notes": reading.notes, "kinds": sorted(reading.kinds)}
+        told = told_of(reading)
     except MemoryError:
         told = {"error": "memory"}
     except RefusedError as error:

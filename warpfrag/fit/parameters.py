@@ -297,7 +297,7 @@ def _default_bounds(scene: Scene, parameter: Parameter, size: float) -> tuple[fl
     vertices = [item.world_vertices() for item in items if len(item.vertices)]
     middle = np.concatenate(vertices).mean(axis=0) if vertices else np.asarray(camera.target)
     z = max(float((camera.view_matrix()[:3, :3] @ (middle - np.asarray(camera.eye)))[2]), camera.near)
-    resolution = float(z_resolution(z, camera.near, camera.far))
+    resolution = float(z_resolution(z, camera.near, camera.far, orthographic=not camera.is_perspective))
     return lower / resolution, upper / resolution
 
 

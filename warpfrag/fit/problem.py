@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from warpfrag.arrays.kinds import NUMPY, kind_of
-from warpfrag.capture.bounded import capture_kbuffer
 from warpfrag.capture.coverage import Coverage
 from warpfrag.composite import composite
 from warpfrag.fit.parameters import with_places
@@ -21,9 +20,8 @@ from warpfrag.fit.scaled_fragments import UnitFragments
 from warpfrag.fit.study import PreparedStudy, Study
 from warpfrag.fit.views import Resolve, View
 from warpfrag.fragments import Fragments
-from warpfrag.render import over_background, render
+from warpfrag.render import Renderer, over_background
 from warpfrag.scene.parameters import BETA
-from warpfrag.scene.scene import Scene
 from warpfrag.storage.kbuffer import kbuffer
 
 # Random starts keep this share of the range away from the bounds, and a study's own this one where no method moves away
@@ -51,9 +49,14 @@ class ViewProblem:
         self.channels = self.reference.shape[2]
 
     @cached_property
+    def renderer(self) -> Renderer:
+        """What makes the images; while nothing moves it keeps what each pixel sees."""
+        return Renderer(self.scene, resolve=self.resolve)
+
+    @property
     def coverage(self) -> Coverage:
         """What each pixel sees, where nothing moves."""
-        return Coverage.of(self.scene, sort=self.resolve == "sorted")
+        return self.renderer.coverage
 
     @cached_property
     def unit(self) -> UnitFragments:
@@ -63,7 +66,7 @@ class ViewProblem:
     @cached_property
     def fragments(self) -> Fragments:
         """The fragments of the scene as it is, where only beta is fitted."""
-        return self.coverage.shade()
+        return self.renderer.fragments()
 
     def parameters(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Return this view's part of parameter values, in single precision."""
@@ -72,11 +75,12 @@ class ViewProblem:
     def image(self, values: Mapping[str, Any]) -> Any:
         """Return the image for parameter values, (H, W, 4) float32; torch tensors get their gradient."""
         parameters = self.parameters(values)
-        if self.has_motion:
-            return render_scene(self.scene, self.resolve, parameters)
-        beta = parameters.pop(BETA.key, float(self.scene.beta))
-        fragments = self.coverage.shade(parameters) if parameters else self.fragments
-        if kind_of(beta) not in (None, NUMPY) and kind_of(fragments.rgba) is NUMPY:
+        if set(parameters) - {BETA.key}:
+            return self.renderer.image(parameters)
+        # Nothing has to be shaded anew.
+        beta = parameters.get(BETA.key, float(self.scene.beta))
+        fragments = self.fragments
+        if kind_of(beta) not in (None, NUMPY):
             fragments = fragments.torch(beta.device)
         return self.over_background(self.composite(fragments, beta))
 
@@ -192,14 +196,6 @@ def _single(value: Any) -> Any:
     return np.asarray(value, np.float32) if kind is None else kind.astype(value, "float32")
 
 
-def render_scene(scene: Scene, resolve: Resolve, parameters: Mapping[str, Any]) -> Any:
-    """Render a scene as `Study.resolve` says."""
-    if resolve == "sorted":
-        return render(scene, parameters=parameters)
-    layers = capture_kbuffer(scene, slots=scene.layers, merge=scene.merge, parameters=parameters)  # type: ignore[arg-type]
-    return over_background(composite(layers), scene.background)
-
-
 def reference_image(study: PreparedStudy, view: View, index: int = 0) -> np.ndarray:
     """Return the image that a view approaches, (H, W, 3 or 4) float32.
 
@@ -217,7 +213,7 @@ def reference_image(study: PreparedStudy, view: View, index: int = 0) -> np.ndar
     samples = reference.supersampling
     fine = replace(scene, camera=view.camera.resized((width * samples, height * samples)), **reference.render_options)
     fine, true = fine.in_units_of(reference.of_view(index, len(study.fitted_views)), "reference.true")
-    image = np.asarray(render_scene(fine, study.asked.resolve, true))
+    image = np.asarray(Renderer(fine, resolve=study.asked.resolve).image(true))
     if samples > 1:
         image = image.reshape(height, samples, width, samples, 4).mean(axis=(1, 3), dtype=np.float64)
     return np.ascontiguousarray(image, np.float32)

@@ -3,6 +3,8 @@
 perspective:   P(z) = z²·δ / (b + z·δ),  b = near·far / (far − near),  δ = 2^−bits
                dP/dz = z·δ (2 b + z·δ) / (b + z·δ)²
 orthographic:  P = (far − near)·δ, for there the buffer is linear;  dP/dz = 0
+
+z is the planar depth, as a depth buffer has it; along a pixel's ray z and P are longer by 1 over its angle's cosine.
 """
 
 from dataclasses import dataclass
@@ -161,7 +163,8 @@ def z_resolution(depth: Any, near: float, far: float, bits: int = DEPTH_BITS, *,
     Differentiable in the depth, on which that of an orthographic camera does not depend.
 
     Args:
-        depth: distance from the eye [scene units], at least 0: a number, or an array of any shape, float32 or float64.
+        depth: planar depth, along the camera's axis [scene units], at least 0: a number, or an array of any shape,
+            float32 or float64. Along a ray of another direction both z and P are longer, by 1 over the angle's cosine.
         near: distance of the near plane [scene units], above 0.
         far: distance of the far plane [scene units], beyond `near`.
         bits: bits of the depth buffer, from 1 to 64.

@@ -93,6 +93,19 @@ def color_of(lists: Any, pixel: int, fragment: int, place: int, depth: Any):
 STORED = Source(FragmentLists, locate, front_of, color_of)
 
 
+@wp.func(inline=True)
+def name_owners(slots: Any, row: int):
+    """Write of each slot in use, the tail last, that its owner owns it; return their number."""
+    count = slots.count[row]
+    if count >= TAIL_IN_USE:
+        count -= TAIL_IN_USE
+        slots.owner[row, count] = slots.owner[row, slots.core]
+        count += 1
+    for layer in range(count):
+        slots.parent[slots.owner[row, layer]] = OWNS_SLOT - layer
+    return count
+
+
 @kernels
 def kbuffer_bwd(number: Any, merging: bool) -> Any:
     """Return the kernel of the way back from layers to fragments."""
@@ -133,13 +146,7 @@ def kbuffer_bwd(number: Any, merging: bool) -> Any:
                     front = front_of(lists, pixel, fragment, fragment, depth)
                 weighted, opacity_sum = color_of(lists, pixel, fragment, fragment, depth)
                 insert(slots, row, shift + fragment, weighted, opacity_sum, front, depth)
-            layer_count = slots.count[row]
-            if layer_count >= TAIL_IN_USE:
-                layer_count -= TAIL_IN_USE
-                slots.owner[row, layer_count] = slots.owner[row, slots.core]
-                layer_count += 1
-            for layer in range(layer_count):
-                slots.parent[slots.owner[row, layer]] = OWNS_SLOT - layer
+            for layer in range(name_owners(slots, row)):
                 slot_sums[row, layer] = no_sums()
             for fragment in range(begin, end):
                 layer = layer_of(slots.parent, shift + fragment)

@@ -10,6 +10,7 @@ import numpy as np
 from pyrender_image import NO_OPENGL
 
 import warpfrag as wf
+from warpfrag.scene.assemble import assemble
 
 SCRIPT = Path(__file__).with_name("pyrender_image.py")
 # OpenGL rounds the projected corners of triangles to so many parts of a pixel (GL_SUBPIXEL_BITS is 8 here).
@@ -81,8 +82,8 @@ def pyrender_image(scene: wf.Scene) -> np.ndarray:
         NoOpenGLError: pyrender or OpenGL is missing.
     """
     camera = scene.camera
-    triangles = np.concatenate([item.world_vertices()[item.faces] for item in scene.objects])
-    colors = np.concatenate([np.asarray(item.color) * item.shade[item.faces[:, :1]] for item in scene.objects])
+    geometry = assemble(scene)
+    triangles, colors = geometry.vertices[geometry.faces], geometry.rgba[geometry.faces[:, 0], :3]
     lens = {"view": camera.view_matrix(), **{key: getattr(camera, key) for key in ("size", "focal", "near", "far")}}
     with tempfile.TemporaryDirectory() as folder:
         source, target = Path(folder) / "scene.npz", Path(folder) / "image.npy"

@@ -260,7 +260,7 @@ def _least_squares(problem: Problem, meter: Meter) -> None:
         key, cost = min(fit.costs.items(), key=lambda item: item[1])
         meter.record(images + len(fit.costs), passes + COLORS * len(fit.jacobians), cost, np.frombuffer(key))
 
-    fit = LeastSquares(problem, Session(problem.study, "", None, look, 0.0))
+    fit = LeastSquares(problem, Session(problem.study.asked, "", None, look, 0.0))
     try:
         fit.run(problem.start())
     finally:
@@ -276,7 +276,7 @@ def _descend(problem: Problem, meter: Meter) -> None:
         meter.record(images + course.evaluations, passes + course.evaluations, course.best_loss, course.best)
 
     method = {"adam": Adam, "lbfgs": LBFGS}[str(problem.study.method)]
-    fit = method(problem, Session(problem.study, "", None, look, 0.0))
+    fit = method(problem, Session(problem.study.asked, "", None, look, 0.0))
     fit.run(problem.start())
 
 

@@ -127,6 +127,36 @@ def cut_member(g: Any, sweep: Any, lists: Any, pixel: int, scratch: Any, base: i
 
 
 @wp.func(inline=True)
+def cut_members(g: Any, sweep: Any, lists: Any, pixel: int, scratch: Any, base: int, mix: int, beta_per: int):
+    """Write what all members' parts are in the present interval, and what is in front of each.
+
+    Returns:
+        How many are opaque; opacity and transmittance of the interval, sum a v, the sum of a (1 - scale without its
+        common divisor) for the mix by opacity, and <g, sum C q v>.
+    """
+    one = type(sweep.end)(1.0)
+    opaque_count = int(0)
+    opacity = type(sweep.end)(0.0)
+    tau = type(sweep.end)(1.0)
+    total = type(sweep.end)(0.0)
+    missing = type(sweep.end)(0.0)
+    g_scale = type(sweep.end)(0.0)
+    for slot in range(sweep.active + sweep.surfaces):
+        a, passed, weight, shown, opaque = cut_member(g, sweep, lists, pixel, scratch, base, slot, mix, beta_per)
+        at = base + position_of(sweep, scratch, base, slot)
+        scratch.transmittance_before[at] = tau
+        scratch.opacity_before[at] = opacity
+        if opaque:
+            opaque_count += 1
+        g_scale += shown
+        total += a * weight
+        missing += a * (weight - one + opacity)
+        opacity += tau * a
+        tau *= passed
+    return opaque_count, opacity, tau, total, missing, g_scale
+
+
+@wp.func(inline=True)
 def cut_adjoint(
     g_share: Any, g_opacity: Any, g_passed: Any, was_active: bool, scratch: Any, at: int, beta: Any, floor: Any
 ):
@@ -184,25 +214,9 @@ def blend_adjoint(
     zero = type(g_tau)(0.0)
     one = type(g_tau)(1.0)
     count = sweep.active + sweep.surfaces
-    opaque_count = int(0)
-    opacity = type(g_tau)(0.0)
-    tau = type(g_tau)(1.0)
-    total = type(g_tau)(0.0)
-    # Of the mix by opacity: sum a_i (1 - scale without its common divisor); of all: <g, sum C_i q_i v_i>.
-    missing = type(g_tau)(0.0)
-    g_scale = type(g_tau)(0.0)
-    for slot in range(count):
-        a, passed, weight, shown, opaque = cut_member(g, sweep, lists, pixel, scratch, base, slot, mix, beta_per)
-        at = base + position_of(sweep, scratch, base, slot)
-        scratch.transmittance_before[at] = tau
-        scratch.opacity_before[at] = opacity
-        if opaque:
-            opaque_count += 1
-        g_scale += shown
-        total += a * weight
-        missing += a * (weight - one + opacity)
-        opacity += tau * a
-        tau *= passed
+    opaque_count, opacity, tau, total, missing, g_scale = cut_members(
+        g, sweep, lists, pixel, scratch, base, mix, beta_per
+    )
     # Where opacity sums far below the opacities leave a thin part all the say, derivatives are beyond any use.
     limit = type(g_tau)(WEIGHT_LIMIT)
     # By itself a part stays as it is, and opaque parts have equal weights.
