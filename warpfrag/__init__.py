@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from warpfrag import baselines, shapes, storage
     from warpfrag.analysis.absorbance import Absorbance, absorbance
-    from warpfrag.analysis.coplanarity import Coplanarity, coplanarity
+    from warpfrag.analysis.coplanarity import coplanarity
     from warpfrag.analysis.csg import csg
     from warpfrag.capture.coverage import capture
     from warpfrag.composite import composite
@@ -42,7 +42,6 @@ __version__ = "0.1.0"
 _HOMES = {
     "Absorbance": "analysis.absorbance",
     "Camera": "scene.camera",
-    "Coplanarity": "analysis.coplanarity",
     "FitError": "fit",
     "FitParameter": "fit",
     "FitResult": "fit",
@@ -78,7 +77,6 @@ _HOMES = {
 __all__ = [
     "Absorbance",
     "Camera",
-    "Coplanarity",
     "FitError",
     "FitParameter",
     "FitResult",

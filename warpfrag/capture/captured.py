@@ -23,7 +23,7 @@ from warpfrag.scene.parameters import Bounds
 from warpfrag.scene.scene import Scene
 from warpfrag.storage.equal_depths import largest_groups
 from warpfrag.storage.method import PixelLists, Room, Stage, Storage, count_fragments
-from warpfrag.storage.methods import METHODS, Counted, check_method, paper_bytes, storage_of
+from warpfrag.storage.methods import METHODS, Counted, check_method, losses, paper_bytes, storage_of
 from warpfrag.storage.request import Request
 
 
@@ -42,7 +42,8 @@ class Captured:
         formula: the memory that the method's paper says it takes, in words of 4 bytes a pixel; see
             `warpfrag.storage.methods`.
         paper_bytes: the same for this capture [bytes].
-        seconds: time of each pass.
+        seconds: time of each pass; that of a count includes finding where the lists begin.
+        sort_seconds: time that sorting took, and putting lists in the order of their pixels.
         objects: number of objects that each pass was given.
     """
 
@@ -56,6 +57,7 @@ class Captured:
     formula: str
     paper_bytes: int
     seconds: tuple[float, ...]
+    sort_seconds: float
     objects: tuple[int, ...]
 
     @property
@@ -96,9 +98,13 @@ class Watch:
 
     def end(self) -> None:
         """Note a pass."""
-        wp.synchronize_device(self.device)
-        self.seconds.append(perf_counter() - self._begin)
+        self.seconds.append(self.elapsed())
         self.objects.append(self._given)
+
+    def elapsed(self) -> float:
+        """Return the time since a pass has begun, or since the last one."""
+        wp.synchronize_device(self.device)
+        return perf_counter() - self._begin
 
     def over(self, storage: Storage) -> Storage:
         """Return the same storage, watched."""
@@ -111,13 +117,16 @@ class Watch:
 
         def allocate(room: Room) -> Any:
             arrays = storage.allocate(room)
+            if storage.counted:
+                self.end()
             self.start()
             return arrays
 
         def collect(arrays: Any, room: Room) -> Any:
             lists = storage.collect(arrays, room)
             assert isinstance(lists, PixelLists)
-            self.arrays = {**_arrays_of(arrays), **_named("lists", vars(lists))}
+            counts = {"counts": room.counts} if storage.counted else {}
+            self.arrays = {**counts, **_arrays_of(arrays), **_named("lists", vars(lists))}
             return lists
 
         stages = tuple(replace(stage, repeat=partial(repeat, stage)) for stage in storage.stages)
@@ -229,14 +238,12 @@ def capture(
         storage = storage_of(method, Request(checked, window.rays(), culling.hide if culling else None))
         watch = Watch(triangles.device, culling.count if culling else lambda: len(surfaces.tables.first_face))
         counts = count_fragments(triangles)
-        if storage.counted:
-            watch.end()
-            watch.arrays["counts"] = counts
+        if not storage.counted:
+            watch.start()
         budget = Budget.of(CaptureSizes.of(triangles, surfaces), memory_limit, surfaces)
-        watched = watch.over(storage)
-        coverage = store_coverage(
-            scene, surfaces.camera, surfaces, triangles, counts, budget, sort=sort, storage=watched
-        )
+        seen = (scene, surfaces.camera, surfaces, triangles, counts, budget)
+        coverage = store_coverage(*seen, sort=sort, storage=watch.over(storage))
+        sort_seconds = watch.elapsed()
         fragments = coverage.shade_surfaces(surfaces, moved=False)
     per_pixel = counts.numpy()
     return Captured(
@@ -245,11 +252,12 @@ def capture(
         len(watch.seconds),
         int(per_pixel.sum(dtype=np.int64)),
         fragments.count,
-        METHODS[method].loses or ("what finds no room in the pool" if storage.loses else ""),
+        losses(method, checked),
         watch.bytes(),
         METHODS[method].formula,
         paper_bytes(method, checked, _counted(fragments, per_pixel), len(per_pixel)),
         tuple(watch.seconds),
+        sort_seconds,
         tuple(watch.objects),
     )
 

@@ -177,6 +177,16 @@ def storage_of(name: str, request: Request) -> Storage:
     return made if isinstance(made, Storage) else made(request)
 
 
+def losses(name: str, options: Options) -> str:
+    """Word what a method may lose with these options; empty for nothing."""
+    words = [METHODS[name].loses] if METHODS[name].loses else []
+    if "grow" in METHODS[name].options and not options.grow:
+        words.append("what finds no room in the pool")
+    if options.max_passes is not None:
+        words.append("what is left after the last pass")
+    return "; ".join(words)
+
+
 def paper_bytes(name: str, options: Options, counted: Counted, pixel_count: int) -> int:
     """Return how much memory the paper of a method says that it takes [bytes]."""
     return round(METHODS[name].words(options, counted) * pixel_count * INDEX_BYTES)
