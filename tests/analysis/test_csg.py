@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+import warp as wp
 from capture_scenes import orthographic, perspective, scene, surface
 
 import warpfrag as wf
@@ -193,6 +194,10 @@ def test_bad_arguments():
     refuse(TypeError, "expression: got int, expected a text", 3, scene=setting)
     refuse(ValueError, "tolerance: got -1", tolerance=-1, scene=setting)
     refuse(TypeError, "fragments: got int, expected Fragments", given=3, scene=setting)
+    in_warp = wf.Fragments(*map(wp.array, (np.zeros((0, 4)), np.zeros(0), np.zeros(0), np.zeros(2, np.int32))), (1, 1))
+    refuse(
+        TypeError, "fragments: got Warp arrays, expected torch tensors or NumPy arrays", given=in_warp, scene=setting
+    )
     refuse(TypeError, "scene: got int, expected a Scene", scene=3, names=["block"])
     refuse(ValueError, "fragments: got none of object_id", given=replace(fragments, object_id=None), scene=setting)
     refuse(

@@ -11,6 +11,7 @@ from planted_scenes import assert_same, expected_pairs, items_of, options_of, pa
 
 import warpfrag as wf
 from warpfrag.capture.coverage import capture
+from warpfrag.scene.visibility import EmptyImageWarning
 from warpfrag.storage.methods import METHODS
 
 DEPTH_BITS = [name for name, method in METHODS.items() if "depth_bits" in method.options]
@@ -219,7 +220,8 @@ def test_images_without_fragments(method):
     """Nothing is captured, nothing is lost."""
     setting = scene(perspective((5, 4)), quad(2.0))
     behind = {"quad.translation": [0.0, 0.0, -5.0]}
-    found = wf.storage.capture(setting, method=method, parameters=behind)
+    with pytest.warns(EmptyImageWarning, match="no object of the scene"):
+        found = wf.storage.capture(setting, method=method, parameters=behind)
     assert found.captured == found.seen == found.lost == 0
     assert found.robustness == 1.0
     assert found.fragments.shape == (4, 5)

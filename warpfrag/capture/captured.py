@@ -21,6 +21,7 @@ from warpfrag.raster.triangles import RasterTriangles
 from warpfrag.scene.camera import Camera
 from warpfrag.scene.parameters import Bounds
 from warpfrag.scene.scene import Scene
+from warpfrag.scene.visibility import warn_if_empty
 from warpfrag.storage.equal_depths import largest_groups
 from warpfrag.storage.method import PixelLists, Room, Stage, Storage, count_fragments
 from warpfrag.storage.methods import METHODS, Counted, check_method, losses, paper_bytes, storage_of
@@ -246,6 +247,7 @@ def capture(
         sort_seconds = watch.elapsed()
         fragments = coverage.shade_surfaces(surfaces, moved=False)
     per_pixel = counts.numpy()
+    warn_if_empty(int(per_pixel.any()), scene, camera)
     return Captured(
         fragments,
         method,
