@@ -98,13 +98,6 @@ def bring_nearer(keys: Any, pixel: int, side: int, key: Any):
 
 
 @wp.func(inline=True)
-def count_middle_once(storage: Any, pixel: int):
-    """Leave the layer in the middle to the front side."""
-    if storage.current.shape[0] > 1 and storage.current[1, pixel] == -storage.current[0, pixel]:
-        storage.current[1, pixel] = type(storage.current[1, pixel])(wp.inf)
-
-
-@wp.func(inline=True)
 def begin_pass(storage: Any, worker: int, pixel: int):
     """Forget what the pass is about to find; a layer with fragments left is still the current one."""
     for side in range(storage.current.shape[0]):
@@ -125,13 +118,6 @@ def begin_pass(storage: Any, worker: int, pixel: int):
 
 
 @wp.func(inline=True)
-def end_pass(storage: Any, worker: int, pixel: int):
-    """See to it that no layer is taken from both sides."""
-    if storage.phase == DEPTH:
-        count_middle_once(storage, pixel)
-
-
-@wp.func(inline=True)
 def advance(storage: Any, worker: int, pixel: int):
     """Go on to the next layers, or to the ids further inside of those that have fragments left."""
     for side in range(storage.current.shape[0]):
@@ -148,7 +134,6 @@ def advance(storage: Any, worker: int, pixel: int):
             storage.last[side, pixel] = storage.current[side, pixel]
             storage.current[side, pixel] = storage.following[side, pixel]
             storage.count[side, pixel] = 0
-    count_middle_once(storage, pixel)
 
 
 @cache
@@ -166,6 +151,7 @@ def visit_layers(take: wp.Function) -> wp.Function:
                 if sides > 1:
                     bring_nearer(storage.current, pixel, 1, -key)
         else:
+            # The layer where both sides meet is the front's.
             side = int(-1)
             if key == storage.current[0, pixel]:
                 side = 0
@@ -252,7 +238,7 @@ def peeling(method: Method, request: Request) -> Storage:
         arrays.phase = next_phase(method, arrays.phase)
         return request.allows(log.passes) and bool(left_of(arrays).any())
 
-    stage = Stage(visit_layers(method.take), begin_pass, end_pass, order="submission", repeat=repeat)
+    stage = Stage(visit_layers(method.take), begin_pass, order="submission", repeat=repeat)
     return Storage(
         method.name,
         Peel,
