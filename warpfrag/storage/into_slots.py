@@ -110,23 +110,36 @@ def finish(storage: Any, worker: int, pixel: int):
 
 
 @cache
-def insert_stage(source: Source, merging: bool) -> Stage:
-    """Return the stage that streams fragments into the slots; without merging every front counts as the depth."""
+def insert_stage(source: Source, merging: bool, culling: bool, counting: bool) -> Stage:
+    """Return the stage that streams fragments into the slots.
+
+    Args:
+        source: what fragments look like.
+        merging: whether a front counts; else it is the depth.
+        culling: whether there are occupancy maps.
+        counting: whether fragments are counted.
+    """
     locate, front_of, color_of = source.locate, source.front, source.color
-    merges = int(merging)
+    merges, culls, counts = int(merging), int(culling), int(counting)
 
     @wp.func(inline=True)
     def visit(storage: Any, worker: int, pixel: int, item: int, depth: Any):
-        tally(storage.occupancy, TALLY_ALL, pixel)
-        if is_culled(storage.occupancy, pixel, depth):
-            tally(storage.occupancy, TALLY_OCCUPANCY, pixel)
+        if counts != 0:
+            tally(storage.occupancy, TALLY_ALL, pixel)
+        culled = bool(False)
+        if culls != 0:
+            culled = is_culled(storage.occupancy, pixel, depth)
+        if culled:
+            if counts != 0:
+                tally(storage.occupancy, TALLY_OCCUPANCY, pixel)
         else:
             place = locate(storage.source, pixel, item)
             front = depth
             if merges != 0:
                 front = front_of(storage.source, pixel, item, place, depth)
             if is_beyond(storage.slots, pixel, front):
-                tally(storage.occupancy, TALLY_BEHIND, pixel)
+                if counts != 0:
+                    tally(storage.occupancy, TALLY_BEHIND, pixel)
             else:
                 rgba, opacity_sum = color_of(storage.source, pixel, item, place, depth)
                 insert(storage.slots, pixel, 0, rgba, opacity_sum, front, depth)
@@ -172,5 +185,8 @@ def kbuffer_storage(
         buffer.occupancy = occupancy
         return buffer
 
-    stages = (*(FILL_MAPS if map_words else ()), insert_stage(source, merge != "none"))
+    stages = (
+        *(FILL_MAPS if map_words else ()),
+        insert_stage(source, merge != "none", map_words > 0, tally_rows is not None),
+    )
     return Storage("kbuffer", structure, allocate, stages, lambda buffer, room: layers, loses=True)
