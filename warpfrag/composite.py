@@ -20,9 +20,9 @@ from warpfrag.arrays.kinds import as_vectors
 from warpfrag.arrays.launch import Span, launch, worker_count
 from warpfrag.arrays.operator import Input, Operator, Output
 from warpfrag.arrays.precisions import kernels
-from warpfrag.fragments import Fragments, Layers
+from warpfrag.fragments import Fragments, Layers, as_int32
 from warpfrag.resolve.exact.exact import ExactOptions, exact_backward, exact_forward, exact_inputs
-from warpfrag.resolve.options import MERGE_INPUTS, MergeOptions, as_int32, check_options, merge_inputs
+from warpfrag.resolve.options import MERGE_INPUTS, MergeOptions, check_options, merge_inputs
 from warpfrag.resolve.pixel import Replay, pixel_beta, sort_pixel, valid_beta
 from warpfrag.resolve.sinks import IMAGE, ImageArrays
 from warpfrag.resolve.walk import ingredients, resolve_bwd, resolve_fwd, walk_backward, walk_forward

@@ -8,10 +8,20 @@ from typing import Any
 import numpy as np
 
 from warpfrag.arrays.kinds import Kind, common_kind, dtype_name, kind_named, kind_of
-from warpfrag.arrays.operator import Output
+from warpfrag.arrays.operator import Input, Output
 from warpfrag.errors import shorten
 
-# What operators return that make layers of fragments.
+# Most dimensions that a wp.array has.
+WARP_DIMENSIONS = 4
+
+# What operators on fragments take, and what those return that make layers of them.
+FRAGMENT_INPUTS = (
+    Input("rgba", "F 4", gradient=True),
+    Input("depth", "F", gradient=True),
+    Input("thickness", "F", gradient=True),
+    Input("offsets", "P+1", "int"),
+    Input("opacity_sum", "F", gradient=True),
+)
 LAYER_OUTPUTS = (
     Output("rgba", "P M 4"),
     Output("depth", "P M"),
@@ -235,6 +245,27 @@ class Layers:
     def torch(self, device: Any = None) -> "Layers":
         """Return the same layers as torch tensors, sharing memory where that is possible."""
         return Layers(**{name: _in_torch(value, device) for name, value in vars(self).items()})
+
+
+def fragment_inputs(fragments: Any, *, dimensions: int) -> dict[str, Any]:
+    """Return `FRAGMENT_INPUTS`, for outputs of so many dimensions beside those of the grid."""
+    if not isinstance(fragments, Fragments):
+        raise TypeError(f"fragments: got {type(fragments).__name__}, expected Fragments")
+    most = WARP_DIMENSIONS - dimensions
+    if fragments.kind == "warp" and len(fragments.shape) > most:
+        raise ValueError(
+            f"fragments: got shape {fragments.shape}, expected at most {most} dimensions: a wp.array has at most "
+            f"{WARP_DIMENSIONS}, of which the result takes {dimensions} more"
+        )
+    inputs = {each.name: getattr(fragments, each.name) for each in FRAGMENT_INPUTS}
+    return {**inputs, "offsets": as_int32(fragments.offsets)}
+
+
+def as_int32(array: Any) -> Any:
+    """Return an index array as int32, itself if it is so already."""
+    kind = kind_of(array)
+    assert kind is not None
+    return kind.astype(array, "int32")
 
 
 def as_layers(outputs: SimpleNamespace, grid: tuple[int, ...]) -> Layers:

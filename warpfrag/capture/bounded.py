@@ -23,13 +23,12 @@ from warpfrag.capture.memory import allowed_memory, fragment_bytes, refuse, spli
 from warpfrag.capture.shade import SHADE, shade_backward, shade_forward
 from warpfrag.capture.surfaces import CameraSurfaces, SurfaceArrays, check_scene, surface_arrays, surfaces_of
 from warpfrag.errors import check_choice, check_whole
-from warpfrag.fragments import Layers
+from warpfrag.fragments import LAYER_OUTPUTS, Layers, as_layers
 from warpfrag.raster.ray import Window, centre_x, centre_y, stretch
 from warpfrag.raster.triangles import prepare_triangles
 from warpfrag.scene.camera import Camera
 from warpfrag.scene.scene import Scene
 from warpfrag.storage.into_slots import (
-    LAYER_OUTPUTS,
     KMerge,
     Source,
     Tail,
@@ -37,7 +36,7 @@ from warpfrag.storage.into_slots import (
     kbuffer_bytes,
     kbuffer_storage,
 )
-from warpfrag.storage.kbuffer import KBufferOptions, as_layers, kbuffer_backward
+from warpfrag.storage.kbuffer import KBufferOptions, kbuffer_backward
 from warpfrag.storage.lists import DYNAMIC, sort_lists
 from warpfrag.storage.method import Room, count_fragments, fill
 from warpfrag.storage.occupancy import TALLY_ALL, TALLY_BEHIND, TALLY_OCCUPANCY, TALLY_ROWS
@@ -109,7 +108,7 @@ class BoundedWindow(Window):
 
     def sizes(self) -> dict[str, int]:
         """Return the sizes of outputs that no input has."""
-        return {"P": self.pixel_count, "slots": self.slots}
+        return {"P": self.pixel_count, "M": self.slots}
 
 
 def operator_arrays(surfaces: CameraSurfaces) -> dict[str, Any]:
@@ -275,7 +274,7 @@ def kbuffer_of_surfaces(
         refuse(needed, allowed, f"{slots} slots for each of {window.pixel_count} pixels")
     options = BoundedWindow(**asdict(window), slots=slots, merge=merge, tail=tail, map_words=map_words)
     outputs = apply(CAPTURE_KBUFFER, operator_arrays(surfaces), options)
-    return as_layers(outputs, (window.row_count, window.width), slots)
+    return as_layers(outputs, (window.row_count, window.width))
 
 
 @dataclass(frozen=True, eq=False)

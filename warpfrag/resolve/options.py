@@ -10,12 +10,10 @@ import warp as wp
 from warpfrag.arrays.kinds import dtype_name, kind_of
 from warpfrag.arrays.operator import Input
 from warpfrag.errors import check_choice, check_number, check_whole
-from warpfrag.fragments import Fragments
+from warpfrag.fragments import FRAGMENT_INPUTS, fragment_inputs
 from warpfrag.scene.names import MERGES, MIXES
-from warpfrag.slabs.lists import FRAGMENT_INPUTS
 
-# Most dimensions that a wp.array has, and most layers: Warp counts in 32 bits.
-WARP_DIMENSIONS = 4
+# Most layers: Warp counts in 32 bits.
 MOST_LAYERS = 2**31 - 1
 
 # Inputs of the operators that resolve fragments; B is 1, or the number of pixels or fragments.
@@ -55,27 +53,6 @@ def merge_inputs(fragments: Any, beta: Any, *, dimensions: int, by_fragment: boo
     inputs = fragment_inputs(fragments, dimensions=dimensions)
     count = fragments.count if by_fragment else None
     return {**inputs, "beta": beta_array(beta, fragments.rgba, fragments.shape, count)}
-
-
-def fragment_inputs(fragments: Any, *, dimensions: int) -> dict[str, Any]:
-    """Return `FRAGMENT_INPUTS`, for outputs of so many dimensions beside those of the grid."""
-    if not isinstance(fragments, Fragments):
-        raise TypeError(f"fragments: got {type(fragments).__name__}, expected Fragments")
-    most = WARP_DIMENSIONS - dimensions
-    if fragments.kind == "warp" and len(fragments.shape) > most:
-        raise ValueError(
-            f"fragments: got shape {fragments.shape}, expected at most {most} dimensions: a wp.array has at most "
-            f"{WARP_DIMENSIONS}, of which the result takes {dimensions} more"
-        )
-    inputs = {each.name: getattr(fragments, each.name) for each in FRAGMENT_INPUTS}
-    return {**inputs, "offsets": as_int32(fragments.offsets)}
-
-
-def as_int32(array: Any) -> Any:
-    """Return an index array as int32, itself if it is so already."""
-    kind = kind_of(array)
-    assert kind is not None
-    return kind.astype(array, "int32")
 
 
 def beta_array(beta: Any, like: Any, shape: tuple[int, ...], fragment_count: int | None = None) -> Any:

@@ -8,22 +8,13 @@ import warp as wp
 
 from warpfrag.arrays.kinds import as_vectors
 from warpfrag.arrays.launch import Span, launch
-from warpfrag.arrays.operator import Input
 from warpfrag.arrays.precisions import Array, Number, Vector4, in_precisions
+from warpfrag.fragments import FRAGMENT_INPUTS
 from warpfrag.slabs.slab import THIN, THINNEST, WEIGHT_LIMIT, divide, log_transmittance
 
 wp.set_module_options({"enable_backward": False})
 
 NO_FRAGMENT = wp.constant(2147483647)
-
-# What operators on fragments take.
-FRAGMENT_INPUTS = (
-    Input("rgba", "F 4", gradient=True),
-    Input("depth", "F", gradient=True),
-    Input("thickness", "F", gradient=True),
-    Input("offsets", "P+1", "int"),
-    Input("opacity_sum", "F", gradient=True),
-)
 
 
 @in_precisions

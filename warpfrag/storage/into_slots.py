@@ -10,7 +10,6 @@ from typing import Any, Literal, get_args
 
 import warp as wp
 
-from warpfrag.arrays.operator import Output
 from warpfrag.arrays.precisions import in_precisions
 from warpfrag.errors import check_choice, check_whole
 from warpfrag.storage.method import Room, Stage, Storage
@@ -34,14 +33,6 @@ Tail = Literal["mix", "discard"]
 
 # Of a slot: colour and opacity, depth, z-thickness, opacity sum: numbers.
 SLOT_NUMBERS = 7
-# The layers that slots become, of P pixels.
-LAYER_OUTPUTS = (
-    Output("rgba", "P slots 4"),
-    Output("depth", "P slots"),
-    Output("thickness", "P slots"),
-    Output("opacity_sum", "P slots"),
-    Output("count", "P", "int"),
-)
 
 
 def check_kbuffer(slots: Any, merge: Any, tail: Any) -> None:

@@ -17,14 +17,13 @@ from typing import Any
 import warp as wp
 
 from warpfrag.arrays.apply import apply
-from warpfrag.arrays.kinds import as_vectors, common_kind
+from warpfrag.arrays.kinds import as_vectors
 from warpfrag.arrays.launch import Span, launch, worker_count
 from warpfrag.arrays.operator import Operator
 from warpfrag.arrays.precisions import kernels
 from warpfrag.arrays.scratch import ROW_GAP
-from warpfrag.fragments import Fragments, Layers
+from warpfrag.fragments import FRAGMENT_INPUTS, LAYER_OUTPUTS, Fragments, Layers, as_layers, fragment_inputs
 from warpfrag.slabs.lists import (
-    FRAGMENT_INPUTS,
     FragmentGradients,
     FragmentLists,
     fragment_gradients,
@@ -32,7 +31,6 @@ from warpfrag.slabs.lists import (
     longest_list,
 )
 from warpfrag.storage.into_slots import (
-    LAYER_OUTPUTS,
     SLOT_NUMBERS,
     KMerge,
     Source,
@@ -47,9 +45,6 @@ from warpfrag.storage.stored import stream
 
 wp.set_module_options({"enable_backward": False})
 
-# Most dimensions that a wp.array has.
-WARP_DIMENSIONS = 4
-
 
 @dataclass(frozen=True)
 class KBufferOptions:
@@ -61,7 +56,7 @@ class KBufferOptions:
 
     def sizes(self) -> dict[str, int]:
         """Return the size of outputs that no input has."""
-        return {"slots": self.slots}
+        return {"M": self.slots}
 
 
 @wp.func(inline=True)
@@ -276,35 +271,4 @@ def kbuffer(fragments: Fragments, slots: int = 8, merge: KMerge = "order_indepen
     """
     check_kbuffer(slots, merge, tail)
     options = KBufferOptions(int(slots), merge, tail)
-    return as_layers(apply(KBUFFER, fragment_arrays(fragments), options), fragments.shape, options.slots)
-
-
-def fragment_arrays(fragments: Fragments) -> dict[str, Any]:
-    """Return the arrays of fragments by the names of `FRAGMENT_INPUTS`.
-
-    Raises:
-        TypeError: they are no `Fragments`.
-        ValueError: a wp.array has no room for as many dimensions as layers of this grid would have.
-    """
-    if not isinstance(fragments, Fragments):
-        raise TypeError(f"fragments: got {type(fragments).__name__}, expected Fragments")
-    most = WARP_DIMENSIONS - 2
-    kind = common_kind({"rgba": fragments.rgba})
-    if kind.name == "warp" and len(fragments.shape) > most:
-        raise ValueError(
-            f"fragments: got shape {fragments.shape}, expected at most {most} dimensions: a wp.array has at most "
-            f"{WARP_DIMENSIONS}, of which the result takes 2 more"
-        )
-    arrays = {each.name: getattr(fragments, each.name) for each in FRAGMENT_INPUTS}
-    return {**arrays, "offsets": kind.astype(fragments.offsets, "int32")}
-
-
-def as_layers(outputs: SimpleNamespace, grid: tuple[int, ...], slots: int) -> Layers:
-    """Return `LAYER_OUTPUTS` of all pixels in one row as the layers of a pixel grid."""
-    return Layers(
-        outputs.rgba.reshape((*grid, slots, 4)),
-        outputs.depth.reshape((*grid, slots)),
-        outputs.thickness.reshape((*grid, slots)),
-        outputs.opacity_sum.reshape((*grid, slots)),
-        outputs.count.reshape(grid),
-    )
+    return as_layers(apply(KBUFFER, fragment_inputs(fragments, dimensions=2), options), fragments.shape)
