@@ -23,7 +23,9 @@ if TYPE_CHECKING:
     from warpfrag.analysis.csg import csg
     from warpfrag.capture.coverage import capture
     from warpfrag.composite import composite
+    from warpfrag.deep import concat, holdout
     from warpfrag.errors import SceneError
+    from warpfrag.files.deep_exr import read_deep, write_deep
     from warpfrag.files.images import read_image, write_image
     from warpfrag.files.scene_file import load_scene
     from warpfrag.fit import FitError, FitParameter, FitResult, Reference, Study, StudyError, View, fit, load_study
@@ -59,17 +61,21 @@ _HOMES = {
     "baselines": "",
     "capture": "capture.coverage",
     "composite": "composite",
+    "concat": "deep",
     "coplanarity": "analysis.coplanarity",
     "csg": "analysis.csg",
     "fit": "fit",
+    "holdout": "deep",
     "kbuffer": "storage.kbuffer",
     "load_scene": "files.scene_file",
     "load_study": "fit",
+    "read_deep": "files.deep_exr",
     "read_image": "files.images",
     "render": "render",
     "resolve": "resolve.resolve",
     "shapes": "",
     "storage": "",
+    "write_deep": "files.deep_exr",
     "write_image": "files.images",
     "z_resolution": "scene.depth_resolution",
 }
@@ -94,17 +100,21 @@ __all__ = [
     "baselines",
     "capture",
     "composite",
+    "concat",
     "coplanarity",
     "csg",
     "fit",
+    "holdout",
     "kbuffer",
     "load_scene",
     "load_study",
+    "read_deep",
     "read_image",
     "render",
     "resolve",
     "shapes",
     "storage",
+    "write_deep",
     "write_image",
     "z_resolution",
 ]

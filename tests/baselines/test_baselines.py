@@ -166,6 +166,25 @@ def test_weights_of_the_paper():
         np.testing.assert_allclose(image, 0.625 * np.array([share, 1.0 - share, 0.0, 1.0 / 1.0]), rtol=1e-12)
 
 
+@pytest.mark.parametrize("equation", [7, 8, 9, 10])
+@pytest.mark.parametrize(("least", "most"), [(-38.0, 38.0), (8.0, 38.0), (-37.0, -30.0), (0.0, 3.0)])
+def test_weighted_gradients_at_any_depth(equation, least, most):
+    """Depths from the smallest to the largest of float32 have the gradients that float64 finds."""
+    fragments = drawn(6, 4)
+    depth = np.float32(10.0 ** np.random.default_rng(6).uniform(least, most, fragments.count))
+    found = {}
+    for dtype in (torch.float64, torch.float32):
+        rgba, z = (torch.tensor(values, dtype=dtype, requires_grad=True) for values in (fragments.rgba, depth))
+        lists = wf.Fragments(rgba, z, torch.zeros_like(z), torch.tensor(fragments.offsets), fragments.shape)
+        image = baselines.weighted_blended(lists, equation=equation)
+        (image * torch.arange(1.0, 5.0, dtype=dtype)).sum().backward()
+        # In relative depth, in which gradients are of the size of the image.
+        found[dtype] = image.detach(), rgba.grad, z.grad.double() * torch.tensor(depth)
+    for right, single in zip(found[torch.float64], found[torch.float32], strict=True):
+        # Powers of depth take six times its rounding; near an opacity of 1 that of its transmittance counts.
+        np.testing.assert_allclose(single, right, rtol=1e-4, atol=1e-5)
+
+
 def test_weighted_opaque_gradient():
     """The gradient at opacity 1 is that of a difference from below."""
     fragments = drawn(5, 3, 4)

@@ -368,6 +368,9 @@ def test_examples_are_listed_rendered_and_copied(folder, capsys):
         "mine/studies/three_spheres.toml",
         "mine/three_spheres.toml",
     ]
+    assert main(["examples", "woven_ball", "-o", "mine"]) == 0
+    assert [path.name for path in Path("mine/assets").iterdir()] == ["lattice.png"]
+    assert main(["render", "mine/woven_ball.toml", "-o", "a.png", "--size", "16x16"]) == 0
     Path("mine/three_spheres.toml").write_text("changed")
     assert main(["examples", "-o", "mine"]) == 2
     assert "expected none in its place" in capsys.readouterr().err

@@ -1,6 +1,8 @@
 """Images to files and back."""
 
 import struct
+import subprocess
+import sys
 import zlib
 
 import numpy as np
@@ -9,6 +11,7 @@ import pytest
 from PIL import Image, ImageCms
 
 from warpfrag.colors import encode, linear_to_srgb
+from warpfrag.files import images
 from warpfrag.files.images import ImageError, read_image, write_image
 
 
@@ -41,6 +44,48 @@ def test_png_rounds_once(tmp_path, image, bits, channels):
     np.testing.assert_array_equal(encode(again, bits), encode(image, bits))
     # The steepest slope of the sRGB curve is about 2.3 in this direction.
     assert np.abs(again - image).max() < 2.5 / 2**bits
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+def test_png_in_bands_is_the_png_in_one_piece(tmp_path, image, monkeypatch, channels):
+    """However many rows are encoded at once, the file has the bytes that it has of all of them."""
+    image = image[..., :channels]
+    monkeypatch.setattr(images, "_BAND_PIXELS", 10)
+    for bits in (8, 16):
+        write_image(tmp_path / "bands.png", image, bits=bits)
+        stored = encode(image, bits)
+        if bits == 8:
+            Image.fromarray(stored).save(tmp_path / "whole.png")
+        else:
+            writer = png.Writer(5, 7, bitdepth=16, greyscale=False, alpha=channels == 4)
+            with (tmp_path / "whole.png").open("wb") as file:
+                writer.write(file, stored.reshape(7, -1))
+        assert (tmp_path / "bands.png").read_bytes() == (tmp_path / "whole.png").read_bytes()
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+@pytest.mark.parametrize("channels", [3, 4])
+def test_png_takes_little_memory(tmp_path, bits, channels):
+    """Beside the image itself writing takes half of its size at most."""
+    pytest.importorskip("resource", reason="this system does not tell how much memory a process took")
+    code = f"""
+import resource
+import numpy as np
+from warpfrag.files.images import write_image
+
+def most():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+write_image("small.png", np.ones((2, 2, {channels})), bits={bits})
+before = most()
+image = np.ones((4096, 2048, {channels}), np.float32)
+write_image("large.png", image, bits={bits})
+print((most() - before) * (1024 if sys.platform == "linux" else 1) / image.nbytes)
+"""
+    run = subprocess.run(
+        [sys.executable, "-c", "import sys" + code], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert float(run.stdout) <= 1.5
 
 
 def test_png_is_straight_srgb(tmp_path):

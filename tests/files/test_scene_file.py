@@ -131,8 +131,10 @@ def test_shipped_scenes_load(path):
         x, y, z = (np.c_[item.world_vertices(), np.ones(len(item.vertices))] @ scene.camera.view_matrix().T).T[:3]
         assert z.min() > scene.camera.near
         assert z.max() < scene.camera.far
-        assert np.abs(x / z).max() * scene.camera.focal < 256
-        assert np.abs(y / z).max() * scene.camera.focal < 256
+        # From scene units, at this depth, to pixels.
+        scale = scene.camera.focal / z if scene.camera.is_perspective else 512 / scene.camera.height
+        assert np.abs(x * scale).max() < 256
+        assert np.abs(y * scale).max() < 256
 
 
 BALL = '[[object]]\nname = "ball"\nprimitive = "sphere"\n'

@@ -82,6 +82,7 @@ def test_shape_and_resized():
         ({"near": True}, "camera.near: got true"),
         ({"size": (0, 5)}, "camera.size"),
         ({"size": (5.5, 5)}, "camera.size"),
+        ({"size": (65536, 65536)}, "camera.size: got .*, up to 2147483646 pixels in all"),
     ],
 )
 def test_refusals_name_the_field(change, words):

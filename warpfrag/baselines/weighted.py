@@ -19,6 +19,9 @@ from typing import Any, Literal
 from warpfrag.baselines.inputs import array_module, exact_image, owners, range_of_depths, ratio, sum_pixels
 from warpfrag.fragments import Fragments
 
+# Beyond this depth, (10) in units of the near plane, weights are at their lower limit: cut there no power overflows.
+_FARTHEST = 1e4
+
 
 def weighted_blended(
     fragments: Fragments,
@@ -57,13 +60,17 @@ def weighted_blended(
 
 
 def _falloff(xp: Any, depth: Any, equation: int, near: float, far: float) -> Any:
-    z = abs(depth)
+    if equation == 10:
+        if far <= near:
+            # All at the same depth are at its front.
+            return 3e3 + 0.0 * depth
+        # Depth in the window of a perspective camera, 1 - d. In units of the near plane no square overflows.
+        relative = xp.clip(depth, near, min(far, _FARTHEST * near)) / near
+        clear = (1.0 / relative - near / far) / (1.0 - near / far)
+        return xp.clip(3e3 * clear**3, 1e-2, 3e3)
+    z = xp.clip(abs(depth), 0.0, _FARTHEST)
     if equation == 7:
         return xp.clip(10.0 / (1e-5 + (z / 5.0) ** 2 + (z / 200.0) ** 6), 1e-2, 3e3)
     if equation == 8:
         return xp.clip(10.0 / (1e-5 + (z / 10.0) ** 3 + (z / 200.0) ** 6), 1e-2, 3e3)
-    if equation == 9:
-        return xp.clip(0.03 / (1e-5 + (z / 200.0) ** 4), 1e-2, 3e3)
-    # Depth in the window of a perspective camera, 1 - d; all at the same depth are at its front.
-    clear = (near / xp.clip(depth, near, far) - near / far) / (1.0 - near / far) if far > near else 1.0 + 0.0 * depth
-    return xp.clip(3e3 * clear**3, 1e-2, 3e3)
+    return xp.clip(0.03 / (1e-5 + (z / 200.0) ** 4), 1e-2, 3e3)

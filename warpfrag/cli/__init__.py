@@ -1,4 +1,4 @@
-"""The command line: `warpfrag render`, `fit`, `inspect` and `examples`.
+"""The command line: `warpfrag render`, `merge`, `flatten`, `fit`, `inspect` and `examples`.
 
 Whatever goes wrong is one line on standard error and exit status 2; Ctrl-C is 130. `WARPFRAG_TRACEBACK=1` lets Python's
 traceback through. Everything heavy is imported by the command that needs it, so that `--help` is quick.
@@ -15,6 +15,8 @@ import typer
 
 from warpfrag.cli.examples import examples
 from warpfrag.cli.fit import fit
+from warpfrag.cli.flatten import flatten
+from warpfrag.cli.merge import merge
 from warpfrag.cli.pixel import inspect
 from warpfrag.cli.render import render
 from warpfrag.cli.streams import close_output, complain, open_streams, warnings_on_one_line
@@ -27,7 +29,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     help="A differentiable multi-fragment compositor: renders scenes and fits their parameters to images.",
 )
-for _command in (render, fit, inspect, examples):
+for _command in (render, merge, flatten, fit, inspect, examples):
     app.command()(_command)
 
 

@@ -1,4 +1,4 @@
-"""`warpfrag render`: a scene to an image."""
+"""`warpfrag render`: a scene to an image, flat or deep."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +15,7 @@ from warpfrag.cli.options import (
     SceneArgument,
     SetOption,
     SizeOption,
+    UsageError,
     VerboseOption,
     parse_background,
     read_scene,
@@ -28,7 +29,9 @@ if TYPE_CHECKING:
 
 def render(
     scene: SceneArgument,
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="A .png, .exr or .npy file.")],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="FILE", help="A .png, .exr or .npy file; .deep.exr is deep.")
+    ],
     beta: BetaOption = None,
     thickness: Annotated[
         str | None,
@@ -45,30 +48,46 @@ def render(
     background: Annotated[
         str | None, typer.Option(metavar="COLOR", help='"#rrggbb[aa]" (sRGB), "r,g,b[,a]" (linear) or none.')
     ] = None,
+    deep: Annotated[bool, typer.Option("--deep", help="Write all fragments: a deep .exr file.")] = False,
     parameters: ParametersOption = None,
     settings: SetOption = None,
     verbose: VerboseOption = False,
 ) -> None:
-    """Render a scene to an image: PNG (sRGB), OpenEXR or .npy (linear, premultiplied) by suffix."""
+    """Render a scene to an image: PNG (sRGB), OpenEXR or .npy (linear, premultiplied) by suffix; deep to .deep.exr."""
     start_warp(verbose)
+    from warpfrag.capture.coverage import capture
+    from warpfrag.files.deep_exr import check_deep_target, write_deep
     from warpfrag.files.images import check_target, write_image
     from warpfrag.render import render as render_scene
 
-    check_target(output, bits=bits)
+    deep = deep or output.name.lower().endswith(".deep.exr")
+    if deep:
+        check_deep_target(output)
+        options = {"beta": beta, "layers": layers, "merge": merge, "mix": mix, "background": background}
+        for name in (name for name, value in options.items() if value is not None):
+            raise UsageError(f"--{name}: got it with a deep image, expected it with a flat one, which is composited")
+    else:
+        check_target(output, bits=bits)
     wanted = read_scene(scene, parameters, settings, beta=beta, layers=layers, merge=merge, mix=mix, size=size)
     if thickness is not None:
         wanted = replace(wanted, objects=[with_thickness(item, thickness) for item in wanted.objects])
     if background is not None:
         wanted = replace(wanted, background=parse_background(background))
     try:
-        image = render_scene(wanted) if method is None else _render_by(wanted, method)
+        if deep:
+            fragments = capture(wanted, method=method or "dfb")
+        else:
+            image = render_scene(wanted) if method is None else _render_by(wanted, method)
     except (RuntimeError, MemoryError) as error:
         # Warp says how many bytes it lacks, not what for.
         if isinstance(error, MemoryError) or "allocate" in str(error):
             size = " × ".join(map(str, wanted.camera.size))
             raise MemoryError(f"size: got {size} pixels, expected what fits into memory ({error})") from error
         raise
-    write_image(output, image, bits=bits)
+    if deep:
+        write_deep(output, fragments)
+    else:
+        write_image(output, image, bits=bits)
 
 
 def _render_by(scene: "Scene", method: str) -> Any:

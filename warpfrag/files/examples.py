@@ -7,6 +7,8 @@ from pathlib import Path
 from warpfrag.errors import SceneError, suggest
 
 PREFIX = "example:"
+# The folder of the meshes, points and images of scenes, beside them.
+_ASSETS = "assets"
 # In the wheel they lie inside of the package, in a clone beside it.
 _FOLDERS = (Path(__file__).parents[1] / "scenes", Path(__file__).parents[2] / "scenes")
 
@@ -48,7 +50,10 @@ def title_of(name: str) -> str:
 
 
 def copy_examples(names: list[str], target: Path) -> list[Path]:
-    """Copy examples to a folder, made if need be, and with a study the scene that it names.
+    """Copy examples to a folder, made if need be, each with the files that it names, a study with its scene.
+
+    Returns:
+        The copies of the examples themselves.
 
     Raises:
         SceneError: a file of that name is there already, with other contents.
@@ -57,15 +62,20 @@ def copy_examples(names: list[str], target: Path) -> list[Path]:
     wanted |= {
         name.removeprefix("studies/"): None for name in names if name.removeprefix("studies/") in example_names()
     }
-    copies = []
-    for name in wanted:
-        source, copy = example_path(PREFIX + name), target / f"{name}.toml"
+    files = {example_path(PREFIX + name): target / f"{name}.toml" for name in wanted}
+    assets = {source: target / _ASSETS / source.name for scene in files for source in _assets(scene)}
+    for source, copy in (files | assets).items():
         if copy.exists() and copy.read_bytes() != source.read_bytes():
             raise SceneError(f"{copy}: got a file with other contents, expected none in its place")
         copy.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(source, copy)
-        copies.append(copy)
-    return copies
+    return list(files.values())
+
+
+def _assets(scene: Path) -> list[Path]:
+    """Return the files that a scene names, beside those of other packages."""
+    text = scene.read_text(encoding="utf-8")
+    return [path for path in sorted((scene.parent / _ASSETS).glob("*")) if f'"{_ASSETS}/{path.name}"' in text]
 
 
 def _folder() -> Path | None:

@@ -6,7 +6,7 @@ linear opacity, so what emits without opacity is lost there; OpenEXR and `.npy` 
 
 import os
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,8 @@ from warpfrag.files.source import ReadingWarning, check_regular, read_regular, w
 SUFFIXES = (".png", ".exr", ".npy")
 # Of images that are only read.
 READ_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".npy")
+# Encoded at once: colours are straightened and curved in float64, in several copies.
+_BAND_PIXELS = 2**16
 
 
 class ImageError(ValueError):
@@ -94,19 +96,19 @@ def write_image(path: str | os.PathLike, image: Any, *, bits: int = 8) -> None:
     """
     path, name = Path(path), wording_of_path(path)
     check_target(path, bits=bits)
-    pixels = np.asarray(image, dtype=np.float32)
+    pixels = np.asarray(image)
     if pixels.ndim != 3 or pixels.shape[2] not in (3, 4) or pixels.size == 0:
         raise ImageError(f"{name}: got an image of shape {pixels.shape}, expected (H, W, 3) or (H, W, 4)")
-    if not np.isfinite(pixels).all():
+    if not all(np.isfinite(band).all() for band in _bands(pixels)):
         raise ImageError(f"{name}: got values that are not finite, expected finite ones")
     try:
         with replacing(path) as partial:
             if path.suffix.lower() == ".png":
                 _write_png(partial, pixels, bits)
             elif path.suffix.lower() == ".exr":
-                write_exr(partial, pixels)
+                write_exr(partial, np.asarray(pixels, dtype=np.float32))
             else:
-                np.save(partial, pixels)
+                np.save(partial, np.asarray(pixels, dtype=np.float32))
     except OSError as error:
         raise ImageError(f"{name}: cannot be written ({error.strerror or error})") from error
 
@@ -167,19 +169,33 @@ def _read_encoded(path: Path) -> np.ndarray:
     return image
 
 
+def _bands(pixels: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield the rows of an image, some at a time and as float32: what is computed from them stays small."""
+    rows = max(1, _BAND_PIXELS // pixels.shape[1])
+    for first in range(0, len(pixels), rows):
+        # What is too large for float32 becomes infinite.
+        with np.errstate(over="ignore"):
+            band = np.asarray(pixels[first : first + rows], dtype=np.float32)
+        yield band
+
+
 def _write_png(path: Path, pixels: np.ndarray, bits: int) -> None:
-    stored = encode(pixels, bits)
+    height, width, channels = pixels.shape
+    stored = (encode(band, bits) for band in _bands(pixels))
     if bits == 8:
         from PIL import Image
 
-        Image.fromarray(stored).save(path, format="PNG")
+        picture, first = Image.new("RGBA" if channels == 4 else "RGB", (width, height)), 0
+        for band in stored:
+            picture.paste(Image.fromarray(band), (0, first))
+            first += len(band)
+        picture.save(path, format="PNG")
         return
     import png
 
-    height, width, channels = stored.shape
     writer = png.Writer(width, height, bitdepth=16, greyscale=False, alpha=channels == 4)
     with path.open("wb") as file:
-        writer.write_packed(file, (row.astype(">u2").tobytes() for row in stored))
+        writer.write_packed(file, (row.astype(">u2").tobytes() for band in stored for row in band))
 
 
 def _read_npy(path: Path) -> np.ndarray:

@@ -38,7 +38,7 @@ from warpfrag.shapes.mesh import GREY, Mesh, smooth_normals, split_faces
 from warpfrag.shapes.surfels import surfels
 
 _OBJECT = ("name", *PLACEMENT_KEYS, "color", "opacity", "thickness", "texture", "normals")
-_PRIMITIVES = {
+PRIMITIVES = {
     "sphere": ("radius", "segments"),
     "cube": ("size",),
     "cylinder": ("radius", "height", "segments"),
@@ -102,15 +102,15 @@ def _objects(entry: Any, index: int, reading: _Reading) -> list[SceneObject]:
     path = f"object[{index}]"
     label = entry.get("name") if isinstance(entry, dict) else ""
     label = label if isinstance(label, str) else ""
-    every = (*_SHAPES, "split", *_OBJECT, *sorted({key for keys in _PRIMITIVES.values() for key in keys}))
+    every = (*_SHAPES, "split", *_OBJECT, *sorted({key for keys in PRIMITIVES.values() for key in keys}))
     table = Table(entry, reading.file, path, every, label)
     shapes = [key for key in _SHAPES if key in table]
     if len(shapes) != 1:
         got = "both " + " and ".join(shapes) if shapes else "no shape"
         raise table.error("", got, "mesh, primitive or points")
     if "primitive" in table:
-        kind = str(table.choice("primitive", tuple(_PRIMITIVES)))
-        Table(entry, reading.file, path, ("primitive", *_OBJECT, *_PRIMITIVES[kind]), label, f'primitive "{kind}"')
+        kind = str(table.choice("primitive", tuple(PRIMITIVES)))
+        Table(entry, reading.file, path, ("primitive", *_OBJECT, *PRIMITIVES[kind]), label, f'primitive "{kind}"')
         name, mesh = kind, _primitive(table, kind)
     elif "points" in table:
         Table(entry, reading.file, path, _POINTS, label, "points")

@@ -1,5 +1,6 @@
 """Studies: what is fitted to which images, and how. `study_file` reads them from TOML."""
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -9,6 +10,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 import warp as wp
 
+from warpfrag.capture.memory import allowed_memory
 from warpfrag.errors import check_choice, check_number, check_whole, shorten
 from warpfrag.fit.losses import ImageLoss
 from warpfrag.fit.parameters import FitParameter, FittedParameter, owners, resolve_parameters
@@ -34,6 +36,11 @@ DEFAULT_STEPS: dict[Method, int] = {"least_squares": 100, "adam": 300, "lbfgs": 
 # Adam stops when the best loss of so many steps is not better than the best before them, L-BFGS after so many steps in
 # a row that changed nothing.
 DEFAULT_PATIENCE: dict[Method, int] = {"least_squares": 1, "adam": 50, "lbfgs": 3}
+# More are a slip of the keyboard: each restart is a fit of its own, and the pyramid of any image ends before.
+MOST_RESTARTS, MOST_SCALES = 10_000, 64
+# Of each view: its reference, and its images at the start and at the end. Of a map: its start and where it is, its
+# gradient and the two moments of it.
+IMAGES_KEPT, MAPS_KEPT = 3, 5
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -121,8 +128,8 @@ class Study:
         if self.method is not None:
             check_choice("method", self.method, get_args(Method))
         check_choice("resolve", self.resolve, get_args(Resolve))
-        for key, least in (("seed", 0), ("restarts", 0), ("scales", 1)):
-            check_whole(key, getattr(self, key), least)
+        for key, least, most in (("seed", 0, math.inf), ("restarts", 0, MOST_RESTARTS), ("scales", 1, MOST_SCALES)):
+            check_whole(key, getattr(self, key), least, most)
         for key in ("steps", "patience", "batch"):
             if getattr(self, key) is not None:
                 check_whole(key, getattr(self, key), 1)
@@ -223,6 +230,7 @@ def _prepare(study: Study) -> PreparedStudy:
     }
     scene, starts = study.scene.in_units_of({name: each.start for name, each in asked.items()})
     views = complete_views(study.views, study.scene, study.reference)
+    _check_memory(views, asked, study.device)
     cameras = [view.camera for view in views if not view.held_out]
     if study.batch is not None and study.batch > len(cameras):
         raise StudyError(f"batch: got {study.batch}, expected up to {len(cameras)}, the views to fit")
@@ -244,6 +252,20 @@ def _prepare(study: Study) -> PreparedStudy:
         steps=DEFAULT_STEPS[method] if study.steps is None else study.steps,
         patience=DEFAULT_PATIENCE[method] if study.patience is None else study.patience,
     )
+
+
+def _check_memory(views: Sequence[View], asked: Mapping[str, FitParameter], device: str) -> None:
+    """Check that there is memory for the least that a fit keeps: reference, start and end of every view, and maps."""
+    pixel_count = sum(view.camera.size[0] * view.camera.size[1] for view in views)
+    maps = sum(each.per == "pixel" for each in asked.values())
+    needed = pixel_count * (IMAGES_KEPT * 4 * 4 + maps * MAPS_KEPT * 8)
+    allowed = allowed_memory(None, wp.get_device(device))
+    if needed > allowed:
+        width, height = max((view.camera.size for view in views), key=math.prod)
+        raise StudyError(
+            f"size: got views of up to {width} × {height} pixels, which take {needed / 2**30:.3g} GiB at "
+            f"least, expected at most {allowed / 2**30:.3g} GiB (half of the free memory)"
+        )
 
 
 def _check_held_out(views: Sequence[View], parameters: Sequence[FittedParameter], count: int) -> None:

@@ -34,18 +34,26 @@ from warpfrag.files.images import ImageError, read_image
 from warpfrag.files.scene_file import CAMERA_KEYS, load_scene, read_camera, read_size
 from warpfrag.files.table import Table, is_number, is_numbers, read_toml
 from warpfrag.fit.parameters import FitParameter, flatten_names
-from warpfrag.fit.study import Method, Study
+from warpfrag.fit.study import MOST_RESTARTS, MOST_SCALES, Method, Study
 from warpfrag.fit.views import RENDER_OPTIONS, Reference, Resolve, StudyError, View
 from warpfrag.scene.names import MERGES, MIXES
 from warpfrag.scene.parameters import PER, Parameter, Thickness, check_name
 from warpfrag.scene.scene import Scene
 
-_INTEGERS = ("steps", "seed", "restarts", "scales", "patience", "batch")
+# Keys that are whole numbers, and between which.
+_MOST_STEPS = 10**9
+_INTEGERS = {
+    "steps": (1, _MOST_STEPS),
+    "seed": (0, 2**63 - 1),
+    "restarts": (0, MOST_RESTARTS),
+    "scales": (1, MOST_SCALES),
+    "patience": (1, _MOST_STEPS),
+    "batch": (1, _MOST_STEPS),
+}
 _NUMBERS = ("delta", "tolerance", "learning_rate", "checkpoint_seconds")
 _TOP: tuple[str, ...] = ("scene", "size", "reference", "view", "parameters", "loss", "method", "resolve", "device")
 _TOP += (*_INTEGERS, *_NUMBERS, *RENDER_OPTIONS)
 _PARAMETER = ("start", "lower", "upper", "per", "learning_rate", "smoothness", "levels")
-_MOST_STEPS = 10**9
 
 
 def load_study(path: str | os.PathLike, *, size: tuple[int, int] | None = None) -> Study:
@@ -71,7 +79,7 @@ def load_study(path: str | os.PathLike, *, size: tuple[int, int] | None = None) 
         values: dict[str, Any] = {
             key: top.choice(key, get_args(kind)) for key, kind in (("method", Method), ("resolve", Resolve))
         }
-        values |= {key: top.integer(key, 0, 2**63 - 1 if key == "seed" else _MOST_STEPS) for key in _INTEGERS}
+        values |= {key: top.integer(key, *span) for key, span in _INTEGERS.items()}
         values |= {key: top.number(key, 0.0) for key in _NUMBERS}
         values["loss"] = top.data.get("loss")
         values["device"] = top.text("device")

@@ -8,6 +8,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from warpfrag.errors import check_choice, check_whole, shorten
+from warpfrag.files.scene_file import MOST_IMAGE_PIXELS
 from warpfrag.scene.assemble import assemble
 from warpfrag.scene.camera import Camera
 from warpfrag.scene.names import MERGES, MIXES
@@ -142,7 +143,13 @@ def check_reference(view: View, scene: Scene, count: int, resolve: Resolve) -> N
         if reference.supersampling != 1 or reference.render_options:
             raise StudyError("reference: got options of a render with an image, expected them with true")
         _check_image(reference, view.camera)
-    check_whole("reference.supersampling", reference.supersampling, 1, MOST_SAMPLES)
+    samples = check_whole("reference.supersampling", reference.supersampling, 1, MOST_SAMPLES)
+    width, height = view.camera.size
+    if samples > 1 and samples * samples * width * height > MOST_IMAGE_PIXELS:
+        raise StudyError(
+            f"reference.supersampling: got {samples} with {width} × {height} pixels, expected up to "
+            f"{MOST_IMAGE_PIXELS} samples in all"
+        )
 
 
 def is_stacked(name: str, value: Any, count: int) -> bool:

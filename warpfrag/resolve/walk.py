@@ -44,7 +44,7 @@ from warpfrag.slabs.lists import (
     valid_fragment,
 )
 from warpfrag.slabs.mix import MIX_AVERAGE, MIX_OPACITY, MIX_OPTICAL_DEPTH
-from warpfrag.slabs.slab import LOG_FLOOR, LOG_OPAQUE, Slab
+from warpfrag.slabs.slab import LOG_FLOOR, LOG_OPAQUE, Slab, finite
 
 wp.set_module_options({"enable_backward": False})
 
@@ -202,7 +202,7 @@ def resolve_bwd(number: Any, merge: int, mix: int, sink: Sink) -> Any:
                     g_beta += g_step
                 store_gradient(g_fragment, lists, scratch.order[at], grads)
             if grads.beta.shape[0] > 0:
-                grads.beta[pixel] = g_beta
+                grads.beta[pixel] = finite(g_beta)
 
     return kernel
 

@@ -19,6 +19,8 @@ from warpfrag.scene.rotation import rotation_matrix
 Axes = Literal["opencv", "opengl"]
 # A matrix counts as a rotation, and pixels count as square, if they differ from that no more than files round.
 ROTATION_TOLERANCE, SQUARE_TOLERANCE = 1e-4, 1e-4
+# Kernels count pixels, and where their fragments begin, in 32 bits.
+MOST_PIXELS = 2**31 - 2
 
 
 @dataclass(frozen=True)
@@ -269,6 +271,7 @@ def _rotation(name: str, matrix: np.ndarray) -> np.ndarray:
 def _size(value: object) -> tuple[int, int]:
     if isinstance(value, (list, tuple, np.ndarray)) and len(value) == 2:
         parts = [int(part) for part in value if is_whole(part)]
-        if len(parts) == 2 and min(parts) >= 1:
+        if len(parts) == 2 and min(parts) >= 1 and parts[0] * parts[1] <= MOST_PIXELS:
             return parts[0], parts[1]
-    raise ValueError(f"camera.size: got {shorten(value)}, expected width and height, two whole numbers from 1")
+    expected = f"width and height, two whole numbers from 1, up to {MOST_PIXELS} pixels in all"
+    raise ValueError(f"camera.size: got {shorten(value)}, expected {expected}")

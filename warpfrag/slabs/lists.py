@@ -10,11 +10,13 @@ from warpfrag.arrays.kinds import as_vectors
 from warpfrag.arrays.launch import Span, launch
 from warpfrag.arrays.precisions import Array, Number, Vector4, in_precisions
 from warpfrag.fragments import FRAGMENT_INPUTS
-from warpfrag.slabs.slab import THIN, THINNEST, WEIGHT_LIMIT, divide, log_transmittance
+from warpfrag.slabs.slab import THIN, THINNEST, WEIGHT_LIMIT, divide, finite, log_transmittance
 
 wp.set_module_options({"enable_backward": False})
 
 NO_FRAGMENT = wp.constant(2147483647)
+# Colours, depths and thicknesses are below the largest number by this factor: what is summed of a pixel is finite too.
+HEADROOM = wp.constant(1024.0)
 
 
 @in_precisions
@@ -75,7 +77,7 @@ def thickness_of(lists: Any, fragment: int):
 
 @wp.func(inline=True)
 def store_gradient(g: Any, lists: Any, fragment: int, grads: Any):
-    """Write the gradient of a fragment, given that of the slab that `load_slab` made of it."""
+    """Write the gradient of a fragment, `finite`, given that of the slab that `load_slab` made of it."""
     opacity = lists.rgba[fragment][3]
     zero = type(opacity)(0.0)
     transmittance = type(opacity)(1.0) - opacity
@@ -89,13 +91,14 @@ def store_gradient(g: Any, lists: Any, fragment: int, grads: Any):
             g_sum = divide(g.weight, opacity, zero)
             g_opacity -= divide(g_sum * lists.opacity_sum[fragment], opacity, zero)
         if grads.opacity_sum.shape[0] > 0:
-            grads.opacity_sum[fragment] = g_sum
+            grads.opacity_sum[fragment] = finite(g_sum)
     if grads.rgba.shape[0] > 0:
-        grads.rgba[fragment] = wp.vector(g.color[0], g.color[1], g.color[2], g_opacity)
+        color = wp.vector(finite(g.color[0]), finite(g.color[1]), finite(g.color[2]))
+        grads.rgba[fragment] = wp.vector(color[0], color[1], color[2], finite(g_opacity))
     if grads.depth.shape[0] > 0:
-        grads.depth[fragment] = g.back
+        grads.depth[fragment] = finite(g.back)
     if grads.thickness.shape[0] > 0:
-        grads.thickness[fragment] = g.thickness
+        grads.thickness[fragment] = finite(g.thickness)
 
 
 @wp.func(inline=True)
@@ -104,8 +107,10 @@ def valid_fragment(lists: Any, fragment: int):
     rgba = lists.rgba[fragment]
     thickness = lists.thickness[fragment]
     zero = type(thickness)(0.0)
-    # Zero times everything: one NaN or infinity anywhere makes the sum NaN.
-    nothing = zero * rgba[0] + zero * rgba[1] + zero * rgba[2] + zero * (lists.depth[fragment] - thickness)
+    # Zero times everything: one NaN or infinity anywhere makes the sum NaN. And what is nearly infinite is as good as.
+    room = type(thickness)(HEADROOM)
+    nothing = zero * (room * rgba[0]) + zero * (room * rgba[1]) + zero * (room * rgba[2])
+    nothing += zero * (room * lists.depth[fragment]) + zero * (room * thickness)
     if lists.opacity_sum.shape[0] > 0:
         opacity_sum = lists.opacity_sum[fragment]
         nothing += zero * opacity_sum
@@ -205,9 +210,10 @@ def report_invalid(invalid: wp.array, inputs: SimpleNamespace, beta_per: str = "
             for each in FRAGMENT_INPUTS
             if each.gradient and getattr(inputs, each.name) is not None
         }
+        most = np.finfo(wp.dtype_to_numpy(inputs.depth.dtype)).max / HEADROOM
         raise ValueError(
             f"fragments: got {', '.join(f'{name} {value}' for name, value in values.items())} in fragment {fragment}, "
-            "expected finite values, opacity from 0 to 1, thickness and opacity_sum of at least 0"
+            f"expected finite values up to {most:.1e}, opacity from 0 to 1, thickness and opacity_sum of at least 0"
         )
     if pixel != NO_FRAGMENT:
         beta = inputs.beta.numpy()[min(pixel, inputs.beta.shape[0] - 1)]

@@ -32,6 +32,9 @@ THINNEST = wp.constant(1.0e-36)
 # The weight of a slab can triple whenever it is divided (all three parts of an opaque slab are opaque). Above this
 # limit no other slab has a say in a mix: there it stays, with no derivative, before it overflows.
 WEIGHT_LIMIT = wp.constant(1.0e12)
+# What a gradient counts as that is beyond the numbers of its precision, as one in a thickness of 1e-36 or an opacity of
+# 1e-24 may be: so large that sums of some, and their products with ordinary numbers, stay finite.
+LARGEST_GRADIENT = wp.constant(1.0e30)
 
 
 @in_precisions
@@ -81,3 +84,15 @@ def overlap(a: Any, b: Any):
 def begins_first(a: Any, b: Any):
     """Tell whether slab a begins in front of slab b; one that begins where the other does, does not."""
     return a.thickness > b.thickness - (b.back - a.back)
+
+
+@wp.func(inline=True)
+def finite(gradient: Any):
+    """Return a gradient; in place of an infinite one the largest, in place of one whose terms cancel there none."""
+    if wp.isfinite(gradient):
+        return gradient
+    if gradient > type(gradient)(0.0):
+        return type(gradient)(LARGEST_GRADIENT)
+    if gradient < type(gradient)(0.0):
+        return -type(gradient)(LARGEST_GRADIENT)
+    return type(gradient)(0.0)

@@ -5,7 +5,7 @@ from typing import Any
 import warp as wp
 
 from warpfrag.slabs.part import optical_gain_adjoint, series
-from warpfrag.slabs.slab import LOG_OPAQUE, SERIES_OPACITY, divide
+from warpfrag.slabs.slab import LOG_OPAQUE, SERIES_OPACITY, divide, finite
 
 wp.set_module_options({"enable_backward": False})
 
@@ -43,7 +43,7 @@ def cut_slab_adjoint(g: Any, s: Any, r: Any, power: Any, beta: Any, floor: Any):
     """
     one = type(g)(1.0)
     g_opacity, g_log_t, g_r = optical_gain_adjoint(-(one - beta) * g, s.opacity, s.log_transmittance, r, power, floor)
-    g_depth = (g_r - beta * g) / s.thickness
+    g_depth = finite((g_r - beta * g) / s.thickness)
     g_beta = g * (one - r - optical_rest(s, r, power))
     return g_opacity, g_log_t, g_depth * (one - r), -g_depth, g_depth, g_beta
 

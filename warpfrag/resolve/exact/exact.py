@@ -55,7 +55,7 @@ from warpfrag.slabs.lists import (
     store_gradient,
     valid_fragment,
 )
-from warpfrag.slabs.slab import Slab
+from warpfrag.slabs.slab import Slab, finite
 
 wp.set_module_options({"enable_backward": False})
 
@@ -318,9 +318,10 @@ def exact_bwd(number: Any, mix: int, beta_per: int) -> Any:
             for position in range(count):
                 fragment = scratch.order[base + position]
                 store_gradient(scratch.grad[base + position], lists, fragment, grads)
-                g_beta += scratch.grad_beta[base + position]
+                g_own = finite(scratch.grad_beta[base + position])
+                g_beta += g_own
                 if beta_per == BETA_FRAGMENT and grads.beta.shape[0] > 0:
-                    grads.beta[fragment] = scratch.grad_beta[base + position]
+                    grads.beta[fragment] = g_own
             if beta_per != BETA_FRAGMENT and grads.beta.shape[0] > 0:
                 grads.beta[pixel] = g_beta
 
