@@ -19,6 +19,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from warpfrag import baselines, shapes, storage
     from warpfrag.analysis.absorbance import Absorbance, absorbance
+    from warpfrag.analysis.coplanarity import coplanarity
+    from warpfrag.analysis.csg import csg
     from warpfrag.capture.coverage import capture
     from warpfrag.composite import composite
     from warpfrag.deep import concat, holdout
@@ -66,6 +68,8 @@ _HOMES = {
     "capture": "capture.coverage",
     "composite": "composite",
     "concat": "deep",
+    "coplanarity": "analysis.coplanarity",
+    "csg": "analysis.csg",
     "fit": "fit",
     "holdout": "deep",
     "kbuffer": "storage.kbuffer",
@@ -106,6 +110,8 @@ __all__ = [
     "capture",
     "composite",
     "concat",
+    "coplanarity",
+    "csg",
     "fit",
     "holdout",
     "kbuffer",

@@ -49,6 +49,14 @@ def test_render_writes_an_image(folder):
     np.testing.assert_allclose(read_image("a.png"), read_image("a.exr"), atol=1e-2)
 
 
+def test_render_by_another_method(folder):
+    """However fragments are found, the image is the same; a method that does not exist is named."""
+    assert main(["render", "scene.toml", "-o", "a.npy"]) == 0
+    assert main(["render", "scene.toml", "-o", "b.npy", "--method", "dual_ll"]) == 0
+    np.testing.assert_array_equal(np.load("a.npy"), np.load("b.npy"))
+    assert main(["render", "scene.toml", "-o", "c.npy", "--method", "f2b_4p"]) == 2
+
+
 def test_render_overrides(folder):
     """Each override gives the image of a scene file that says the same."""
     changes = [

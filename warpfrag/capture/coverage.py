@@ -11,6 +11,7 @@ whose gradient `capture` gives: near the parameters at which coverage was found 
 or changes its place in the order.
 """
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
@@ -46,7 +47,9 @@ from warpfrag.scene.parameters import Bounds
 from warpfrag.scene.scene import Scene
 from warpfrag.scene.visibility import warn_if_empty
 from warpfrag.storage.lists import DYNAMIC, sort_lists
-from warpfrag.storage.method import Room, Storage, count_fragments, fill
+from warpfrag.storage.method import Room, Storage, count_fragments, fill, total_of
+from warpfrag.storage.methods import METHODS, check_method, storage_of
+from warpfrag.storage.request import Request
 
 wp.set_module_options({"enable_backward": False})
 
@@ -87,6 +90,7 @@ class Coverage:
         *,
         parameters: Mapping[str, Any] | None = None,
         sort: bool = True,
+        method: str = "dfb",
         memory_limit: float | None = None,
     ) -> "Coverage":
         """Find out which triangles each pixel sees.
@@ -96,6 +100,7 @@ class Coverage:
             camera: where from; default the scene's.
             parameters: as for `capture`; gradients are not recorded. Arrays lie on the device of the tensors.
             sort: order of a pixel's fragments: by depth, or as submitted.
+            method: as for `capture`.
             memory_limit: as for `capture`.
 
         Raises:
@@ -107,7 +112,8 @@ class Coverage:
         surfaces = surfaces_of(scene, camera, parameters)
         with surfaces.in_order():
             window = Window.of(surfaces.camera)
-            return find_coverage(scene, surfaces.camera, surfaces, window, sort=sort, memory_limit=memory_limit)
+            seen = (scene, surfaces.camera, surfaces, window)
+            return find_coverage(*seen, sort=sort, method=method, memory_limit=memory_limit)
 
     @property
     def count(self) -> int:
@@ -208,12 +214,20 @@ def find_coverage(
     window: Window,
     *,
     sort: bool,
+    method: str = "dfb",
     memory_limit: float | None,
 ) -> Coverage:
     """Find out which of the surfaces the pixels of a window see; arguments are those of `Coverage.of`."""
+    storage = storage_of(method, Request(check_method(method, {}), window.rays()))
     triangles = surfaces.triangles(window)
-    budget = Budget.of(CaptureSizes.of(triangles, surfaces), memory_limit, surfaces)
-    return store_coverage(scene, camera, surfaces, triangles, count_fragments(triangles), budget, sort=sort)
+    budget, counts = Budget.of(CaptureSizes.of(triangles, surfaces), memory_limit, surfaces), count_fragments(triangles)
+    coverage = store_coverage(scene, camera, surfaces, triangles, counts, budget, sort=sort, storage=storage)
+    if storage.loses and coverage.count < (seen := total_of(counts)):
+        warnings.warn(
+            f"method: {method} captured {coverage.count} of {seen} fragments; it loses {METHODS[method].loses}",
+            stacklevel=3,
+        )
+    return coverage
 
 
 def store_coverage(
@@ -259,13 +273,14 @@ def capture(
     camera: Camera | Sequence[Camera] | None = None,
     sort: bool = True,
     *,
+    method: str = "dfb",
     parameters: Mapping[str, Any] | None = None,
     rows: tuple[int, int] | None = None,
     bounds: Bounds = "clamp",
     memory_limit: float | None = None,
     device: Any = None,
 ) -> Fragments:
-    """Capture every surface that a pixel's ray meets as a fragment (the dynamic fragment buffer).
+    """Capture every surface that a pixel's ray meets as a fragment.
 
     A triangle covers a pixel if the pixel's centre lies in its projection: by the top-left rule on edges, from both
     sides, between the near and far planes. Differentiable in vertices, translations and rotations of objects and
@@ -277,6 +292,8 @@ def capture(
         scene: what to capture.
         camera: where from; default the scene's. Several, of one size, give fragments of shape (N, H, W).
         sort: order of a pixel's fragments: by (depth, object, primitive), or as submitted, by (object, primitive).
+        method: how to find the fragments, one of `warpfrag.storage.methods` with its own defaults; default the dynamic
+            fragment buffer. A warning tells how many fragments a method has lost; `wf.storage.capture` tells more.
         parameters: values in place of the scene's own, by the names of `scene.parameters()`: numbers, NumPy arrays,
             torch tensors or Warp arrays, in which the fragments are then differentiable (Warp arrays on an active tape,
             which takes torch). `"thickness"` is that of all objects without a value of their own here. `"beta"` is not
@@ -310,7 +327,8 @@ def capture(
             surfaces = surfaces_of(scene, view, values, bounds=bounds, device=place)
             window = Window.of(surfaces.camera, checked_rows)
             with surfaces.in_order():
-                coverage = find_coverage(scene, surfaces.camera, surfaces, window, sort=sort, memory_limit=memory_limit)
+                seen = (scene, surfaces.camera, surfaces, window)
+                coverage = find_coverage(*seen, sort=sort, method=method, memory_limit=memory_limit)
                 if rows is None:
                     warn_if_empty(coverage.count, scene, view)
                 found.append(surfaces.given(coverage.shade_surfaces(surfaces, moved=False)))

@@ -1,8 +1,9 @@
 """`warpfrag render`: a scene to an image, flat or deep."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -31,6 +32,9 @@ from warpfrag.errors import check_choice
 # What an image file holds of what `render` gives.
 SHOWN = ("color", "depth", "normal", "object_id", "count")
 
+if TYPE_CHECKING:
+    from warpfrag.scene.scene import Scene
+
 
 def render(
     scene: SceneArgument,
@@ -53,6 +57,9 @@ def render(
     show: Annotated[
         str, typer.Option("--show", metavar="OUTPUT", help="color, depth, normal, object_id or count (of layers).")
     ] = "color",
+    method: Annotated[
+        str | None, typer.Option(metavar="NAME", help="How to find fragments, such as f2b_2p; see warpfrag.storage.")
+    ] = None,
     bits: Annotated[int, typer.Option(help="Bits per channel of a PNG file, 8 or 16.")] = 8,
     background: Annotated[
         str | None, typer.Option(metavar="COLOR", help='"#rrggbb[aa]" (sRGB), "r,g,b[,a]" (linear) or none.')
@@ -76,15 +83,19 @@ def render(
     from warpfrag.render import render as render_scene
 
     deep = deep or output.name.lower().endswith(".deep.exr")
+    drawn = {
+        "resolve": resolve,
+        "samples": None if samples == "1" else samples,
+        "show": None if show == "color" else show,
+    }
     if deep:
         check_deep_target(output)
-        given = {"beta": beta, "layers": layers, "merge": merge, "mix": mix, "background": background}
-        given |= {"resolve": resolve, "samples": None if samples == "1" else samples}
-        given["show"] = None if show == "color" else show
-        for name in (name for name, value in given.items() if value is not None):
-            raise UsageError(f"--{name}: got it with a deep image, expected it with a flat one, which is composited")
+        composited = {"beta": beta, "layers": layers, "merge": merge, "mix": mix, "background": background}
+        _refuse({**composited, **drawn}, "with a deep image, expected it with a flat one, which is composited")
     else:
         check_target(output, bits=bits)
+    if method is not None:
+        _refuse(drawn, "with --method, expected one of the two")
     check_choice("--show", show, SHOWN, UsageError)
     options = {"samples": parse_whole("--samples", samples, 1), "resolve": resolve}
     on = parse_device(device)
@@ -95,7 +106,9 @@ def render(
         wanted = replace(wanted, background=parse_background(background))
     try:
         if deep:
-            fragments = capture(wanted, device=on)
+            fragments = capture(wanted, method=method or "dfb", device=on)
+        elif method is not None:
+            image = _render_by(wanted, method, on)
         else:
             image = render_scene(wanted, output=show, device=on, **options)  # type: ignore[arg-type]
     except (RuntimeError, MemoryError) as error:
@@ -110,3 +123,21 @@ def render(
         write_image(output, image, bits=bits)
     elif told := write_values(output, show, image, bits=bits):
         print(told)
+
+
+def _refuse(options: Mapping[str, Any], why: str) -> None:
+    """Raise if one of the options is given."""
+    for name, value in options.items():
+        if value is not None:
+            raise UsageError(f"--{name}: got it {why}")
+
+
+def _render_by(scene: "Scene", method: str, device: str | None) -> Any:
+    """Return the image of the fragments that a method captures."""
+    from warpfrag.capture.coverage import capture
+    from warpfrag.composite import composite
+    from warpfrag.samples import over_background
+
+    fragments = capture(scene, method=method, device=device)
+    image = composite(fragments, scene.beta, max_layers=scene.layers, merge=scene.merge, mix=scene.mix)
+    return over_background(image, scene.background)

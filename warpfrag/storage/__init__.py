@@ -7,7 +7,9 @@ from importlib import import_module
 from typing import Any
 
 _HOMES = {
+    "Captured": "warpfrag.capture.captured",
     "Culling": "warpfrag.capture.bounded",
+    "capture": "warpfrag.capture.captured",
     "capture_kbuffer": "warpfrag.capture.bounded",
     "count_culled": "warpfrag.capture.bounded",
     "kbuffer_bytes": "warpfrag.storage.into_slots",

@@ -12,7 +12,7 @@ sorting and memory limits are those of all.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -39,6 +39,7 @@ class Room:
             what, and of how many fragments it knows already; raises `MemoryError` if that is too much.
         keep_depths: whether the depths of fragments are to be kept beside them.
         counts: number of fragments of each pixel, (P,) int32; for storages that are `counted`.
+        serial: whether there is one worker on the CPU, whatever the number of threads.
     """
 
     pixel_count: int
@@ -47,10 +48,13 @@ class Room:
     reserve: Callable[[int, str, int], None]
     keep_depths: bool = True
     counts: wp.array | None = None
+    serial: bool = False
 
     @property
     def workers(self) -> int:
         """Number of workers, who are numbered from 0."""
+        if self.serial:
+            return 1
         return worker_count(self.pixel_count, self.device, 0) if self.device.is_cpu else 1
 
 
@@ -103,6 +107,8 @@ class Storage:
         collect: `(arrays, room)`: what is left: `PixelLists`, which the rest of a capture takes, or slots.
         loses: whether there may be fragments that it drops.
         counted: whether it wants to know each pixel's number of fragments beforehand, which is a pass of its own.
+        serial: whether it needs one worker for the whole image on the CPU, as which fragments it drops would else
+            depend on the number of threads.
     """
 
     name: str
@@ -112,6 +118,7 @@ class Storage:
     collect: Callable[[Any, Room], Any]
     loses: bool = False
     counted: bool = False
+    serial: bool = False
 
 
 def fill(storage: Storage, triangles: RasterTriangles, room: Room) -> Any:
@@ -120,6 +127,7 @@ def fill(storage: Storage, triangles: RasterTriangles, room: Room) -> Any:
     Raises:
         MemoryError: the storage would take more than the room allows.
     """
+    room = replace(room, serial=storage.serial)
     arrays = storage.allocate(room)
     for stage in storage.stages:
         again = True
@@ -154,6 +162,20 @@ def count_fragments(triangles: RasterTriangles) -> wp.array:
     arrays.counts = wp.zeros(triangles.window.pixel_count, dtype=int, device=triangles.device)
     cover(triangles, arrays, count_one)
     return arrays.counts
+
+
+def total_of(counts: wp.array) -> int:
+    """Return the number of all fragments.
+
+    Raises:
+        ValueError: there are more than 32-bit offsets can count.
+    """
+    total = int(counts.numpy().sum(dtype=np.int64))
+    if total > MOST_FRAGMENTS:
+        raise ValueError(
+            f"capture: got {total} fragments, expected at most {MOST_FRAGMENTS}; capture fewer rows at a time"
+        )
+    return total
 
 
 def scan_counts(counts: wp.array) -> tuple[wp.array, int]:
