@@ -18,7 +18,7 @@ import warp as wp
 from warpfrag.arrays.apply import apply
 from warpfrag.arrays.kinds import as_vectors
 from warpfrag.arrays.launch import Span, launch, worker_count
-from warpfrag.arrays.operator import Input, Operator, Output
+from warpfrag.arrays.operators import Input, Operator, Output
 from warpfrag.arrays.precisions import kernels
 from warpfrag.fragments import Fragments, Layers, as_int32
 from warpfrag.resolve.exact.exact import ExactOptions, exact_backward, exact_forward, exact_inputs

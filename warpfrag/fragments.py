@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from warpfrag.arrays.kinds import Kind, common_kind, dtype_name, kind_named, kind_of
-from warpfrag.arrays.operator import Input, Output
+from warpfrag.arrays.operators import Input, Output
 from warpfrag.errors import shorten
 
 # Most dimensions that a wp.array has.

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from warpfrag.arrays.kinds import common_kind
-from warpfrag.arrays.operator import NoOptions, Operator
+from warpfrag.arrays.operators import NoOptions, Operator
 
 
 def apply(operator: Operator, arrays: Mapping[str, Any], options: Any = None) -> SimpleNamespace:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpfrag.arrays.operator import Operator, empty_outputs, named
+from warpfrag.arrays.operators import Operator, empty_outputs, named
 
 
 class Kind:

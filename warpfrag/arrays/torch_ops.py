@@ -12,7 +12,7 @@ import torch.autograd.forward_ad as forward_ad
 import warp as wp
 
 from warpfrag.arrays.kinds import Kind
-from warpfrag.arrays.operator import LISTENERS, OPERATORS, Operator, named
+from warpfrag.arrays.operators import LISTENERS, OPERATORS, Operator, named
 
 _LIBRARY = "warpfrag"
 _SCHEMA_TYPES = {int: "int", float: "float", str: "str", bool: "bool"}

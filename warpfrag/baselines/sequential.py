@@ -13,7 +13,7 @@ import warp as wp
 from warpfrag.arrays.apply import apply
 from warpfrag.arrays.kinds import as_vectors, common_kind
 from warpfrag.arrays.launch import launch, worker_count
-from warpfrag.arrays.operator import Input, Operator, Output
+from warpfrag.arrays.operators import Input, Operator, Output
 from warpfrag.fragments import Fragments, as_int32
 
 _INPUTS = (Input("rgba", "F 4"), Input("depth", "F"), Input("offsets", "P+1", "int"))

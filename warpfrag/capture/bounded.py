@@ -17,7 +17,7 @@ import warp as wp
 
 from warpfrag.arrays.apply import apply
 from warpfrag.arrays.kinds import add_in_place
-from warpfrag.arrays.operator import Input, Operator, empty_outputs
+from warpfrag.arrays.operators import Input, Operator, empty_outputs
 from warpfrag.capture.interpolation import hit_of, shade_color, shade_thickness
 from warpfrag.capture.memory import allowed_memory, fragment_bytes, refuse, split_rows
 from warpfrag.capture.shade import SHADE, shade_backward, shade_forward

@@ -23,16 +23,14 @@ import warp as wp
 from warpfrag.arrays.apply import apply
 from warpfrag.arrays.devices import check_device
 from warpfrag.arrays.kinds import WARP, dtype_name, kind_of
-from warpfrag.arrays.launch import Span, launch
-from warpfrag.arrays.precisions import kernels
+from warpfrag.arrays.launch import launch
 from warpfrag.arrays.warp_calls import call_with_warp, named_values
 from warpfrag.capture.batch import check_views, stack_fragments
-from warpfrag.capture.corner_gradients import ShadedGradients, fragment_adjoint, load_corners
 from warpfrag.capture.memory import Budget, CaptureSizes
+from warpfrag.capture.motions import motion_bwd
 from warpfrag.capture.shade import SHADE, shaded_gradients
 from warpfrag.capture.surfaces import (
     CameraSurfaces,
-    SurfaceArrays,
     SurfaceTables,
     check_scene,
     surface_arrays,
@@ -40,7 +38,7 @@ from warpfrag.capture.surfaces import (
 )
 from warpfrag.errors import is_whole
 from warpfrag.fragments import Fragments
-from warpfrag.raster.ray import Window, centre_x, centre_y
+from warpfrag.raster.ray import Window
 from warpfrag.raster.triangles import RasterTriangles
 from warpfrag.scene.camera import Camera
 from warpfrag.scene.parameters import Bounds
@@ -50,8 +48,6 @@ from warpfrag.storage.lists import DYNAMIC, sort_lists
 from warpfrag.storage.method import Room, Storage, count_fragments, fill, total_of
 from warpfrag.storage.methods import METHODS, check_method, storage_of
 from warpfrag.storage.request import Request
-
-wp.set_module_options({"enable_backward": False})
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,12 +252,11 @@ def store_coverage(
     Raises:
         MemoryError: there would be more fragments than the budget allows.
     """
-    pixel_count = counts.shape[0]
 
     def reserve(storage_bytes: int, what: str, fragment_count: int) -> None:
-        budget.check(fragment_count, pixel_count, what, storage_bytes)
+        budget.check(fragment_count, counts.shape[0], what, storage_bytes)
 
-    room = Room(pixel_count, triangles.points.dtype, triangles.device, reserve, sort, counts)
+    room = Room(counts.shape[0], triangles.points.dtype, triangles.device, reserve, sort, counts)
     lists = fill(storage, triangles, room)
     sort_lists(lists)
     found = (triangles.corners, lists.items, lists.offsets, triangles.points)
@@ -345,48 +340,6 @@ def _check_rows(rows: Any, camera: Camera) -> tuple[int, int]:
     if not all(map(is_whole, (begin, end))) or not 0 <= begin <= end <= height:
         raise ValueError(f"rows: got {rows!r}, expected whole numbers (begin, end) with 0 <= begin <= end <= {height}")
     return int(begin), int(end)
-
-
-@kernels
-def motion_bwd(number: Any) -> Any:
-    """Return the kernel of the gradients in rigid motions."""
-
-    def kernel(
-        span: Span,
-        surface: SurfaceArrays[number],
-        faces: wp.array(dtype=int),
-        offsets: wp.array(dtype=int),
-        grads: ShadedGradients[number],
-        motions: wp.array2d(dtype=wp.vec3d),
-    ):
-        """Turn the gradients of fragments into forces and torques.
-
-        Args:
-            span: the pixels.
-            surface: what was shaded.
-            faces: triangle of each fragment, (F,).
-            offsets: see `Fragments`, (P + 1,).
-            grads: gradients of the fragments.
-            motions: output, force [1 / scene unit] and torque [1 / radian] of each fragment, (F, 2).
-        """
-        rays = surface.rays
-        for pixel in range(span.begin + wp.tid(), span.end, span.stride):
-            row = pixel // rays.width
-            x = centre_x(rays, pixel - row * rays.width)
-            y = centre_y(rays, row)
-            for fragment in range(offsets[pixel], offsets[pixel + 1]):
-                triangle = load_corners(surface, faces[fragment])
-                gradients = fragment_adjoint(surface, triangle, grads, fragment, pixel, x, y, True)
-                force = gradients.point_a + gradients.point_b + gradients.point_c
-                torque = (
-                    wp.cross(triangle.point_a, gradients.point_a)
-                    + wp.cross(triangle.point_b, gradients.point_b)
-                    + wp.cross(triangle.point_c, gradients.point_c)
-                )
-                motions[fragment, 0] = force
-                motions[fragment, 1] = torque
-
-    return kernel
 
 
 def _cotangent(name: str, grad: Any, shape: tuple[int, ...], surfaces: CameraSurfaces) -> wp.array | None:

@@ -12,7 +12,7 @@ import warp as wp
 from warpfrag.arrays.apply import apply
 from warpfrag.arrays.kinds import as_vectors, kind_of
 from warpfrag.arrays.launch import Span, launch
-from warpfrag.arrays.operator import Input, Operator, Output
+from warpfrag.arrays.operators import Input, Operator, Output
 from warpfrag.arrays.precisions import kernels
 from warpfrag.capture.coverage import Coverage
 from warpfrag.capture.surfaces import CameraSurfaces

@@ -19,7 +19,7 @@ import warp as wp
 
 from warpfrag.arrays.kinds import as_vectors
 from warpfrag.arrays.launch import Span, launch
-from warpfrag.arrays.operator import Input, Operator, Output
+from warpfrag.arrays.operators import Input, Operator, Output
 from warpfrag.arrays.precisions import Array, Number, Vector4, in_precisions, kernels
 from warpfrag.capture.corner_gradients import (
     CornerGradients,

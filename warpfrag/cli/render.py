@@ -1,6 +1,7 @@
 """`warpfrag render`: a scene to an image, flat or deep."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -104,25 +105,31 @@ def render(
         wanted = replace(wanted, objects=[with_thickness(item, thickness) for item in wanted.objects])
     if background is not None:
         wanted = replace(wanted, background=parse_background(background))
-    try:
+    with _lack_of_memory(wanted):
         if deep:
             fragments = capture(wanted, method=method or "dfb", device=on)
         elif method is not None:
             image = _render_by(wanted, method, on)
         else:
             image = render_scene(wanted, output=show, device=on, **options)  # type: ignore[arg-type]
-    except (RuntimeError, MemoryError) as error:
-        # Warp says how many bytes it lacks, not what for.
-        if isinstance(error, MemoryError) or "allocate" in str(error):
-            size = " × ".join(map(str, wanted.camera.size))
-            raise MemoryError(f"size: got {size} pixels, expected what fits into memory ({error})") from error
-        raise
     if deep:
         write_deep(output, fragments)
     elif show == "color":
         write_image(output, image, bits=bits)
     elif told := write_values(output, show, image, bits=bits):
         print(told)
+
+
+@contextmanager
+def _lack_of_memory(scene: "Scene") -> Iterator[None]:
+    """Say for what memory is lacking: Warp says how many bytes, not what for."""
+    try:
+        yield
+    except (RuntimeError, MemoryError) as error:
+        if isinstance(error, MemoryError) or "allocate" in str(error):
+            size = " × ".join(map(str, scene.camera.size))
+            raise MemoryError(f"size: got {size} pixels, expected what fits into memory ({error})") from error
+        raise
 
 
 def _refuse(options: Mapping[str, Any], why: str) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from warpfrag.arrays.kinds import dtype_name, kind_of
-from warpfrag.arrays.operator import Input
+from warpfrag.arrays.operators import Input
 from warpfrag.errors import check_choice, check_number, check_whole
 from warpfrag.fragments import FRAGMENT_INPUTS, fragment_inputs
 from warpfrag.scene.names import MERGES, MIXES

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from warpfrag.arrays.apply import apply
-from warpfrag.arrays.operator import Operator
+from warpfrag.arrays.operators import Operator
 from warpfrag.fragments import LAYER_OUTPUTS, Fragments, Layers, as_layers
 from warpfrag.resolve.exact.exact import RESOLVE_EXACT, exact_inputs
 from warpfrag.resolve.options import MERGE_INPUTS, MergeOptions, check_options, merge_inputs

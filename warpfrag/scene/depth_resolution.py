@@ -18,7 +18,7 @@ import warp as wp
 from warpfrag.arrays.apply import apply
 from warpfrag.arrays.kinds import dtype_name, kind_of
 from warpfrag.arrays.launch import Span, launch
-from warpfrag.arrays.operator import Input, Operator, Output
+from warpfrag.arrays.operators import Input, Operator, Output
 from warpfrag.arrays.precisions import kernels
 from warpfrag.errors import check_number, check_whole
 

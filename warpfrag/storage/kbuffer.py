@@ -19,7 +19,7 @@ import warp as wp
 from warpfrag.arrays.apply import apply
 from warpfrag.arrays.kinds import as_vectors
 from warpfrag.arrays.launch import Span, launch, worker_count
-from warpfrag.arrays.operator import Operator
+from warpfrag.arrays.operators import Operator
 from warpfrag.arrays.precisions import kernels
 from warpfrag.arrays.scratch import ROW_GAP
 from warpfrag.fragments import FRAGMENT_INPUTS, LAYER_OUTPUTS, Fragments, Layers, as_layers, fragment_inputs

@@ -21,7 +21,7 @@ from typing import Any
 import warp as wp
 
 from warpfrag.arrays.launch import Span, launch, worker_count
-from warpfrag.arrays.operator import Operator
+from warpfrag.arrays.operators import Operator
 from warpfrag.arrays.precisions import kernels
 from warpfrag.arrays.scratch import ROW_GAP, fill_rows, row_bytes
 from warpfrag.fragments import LAYER_OUTPUTS, Fragments
