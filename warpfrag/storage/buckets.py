@@ -224,10 +224,7 @@ def bun_ll(request: Request) -> Storage:
         return arrays
 
     def repeat(arrays: Any, room: Room) -> bool:
-        if pool.overflows(arrays, room, log):
-            return True
-        pool.log(arrays, room, log)
-        return False
+        return pool.overflows_or_logs(arrays, room, log)
 
     stages = (FIND_RANGE, Stage(link_in_bucket, order="submission", repeat=repeat))
     return Storage(

@@ -146,6 +146,13 @@ class Pool:
         self.lost += lost
         return False
 
+    def overflows_or_logs(self, arrays: Any, room: Room, log: Log) -> bool:
+        """Tell whether a pass has to be repeated; if not, add what it found to a log."""
+        if self.overflows(arrays, room, log):
+            return True
+        self.log(arrays, room, log)
+        return False
+
     def empty(self, nodes: Any) -> None:
         """Begin all lists anew."""
         nodes.heads.fill_(-1)
@@ -218,10 +225,7 @@ def _linked(name: str, request: Request, page: int, stage: Stage) -> Storage:
         return arrays
 
     def repeat(arrays: Any, room: Room) -> bool:
-        if pool.overflows(arrays, room, log):
-            return True
-        pool.log(arrays, room, log)
-        return False
+        return pool.overflows_or_logs(arrays, room, log)
 
     stages = (Stage(stage.visit, order=stage.order, repeat=repeat),)
     return Storage(
