@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 import warpfrag as wf
-from warpfrag.render import over_background
+from warpfrag.samples import over_background
 from warpfrag.scene.scene import Scene
 
 # Points that the pen went through, as shares of the image's width and height, and the breadth of the soft edge.

@@ -22,7 +22,7 @@ import warpfrag as wf  # noqa: E402
 from warpfrag.files.images import write_image  # noqa: E402
 from warpfrag.fit import FitParameter, FitResult, Reference, Study  # noqa: E402
 from warpfrag.fit.losses import psnr  # noqa: E402
-from warpfrag.render import over_background  # noqa: E402
+from warpfrag.samples import over_background  # noqa: E402
 from warpfrag.studies.summary import Figure, Summary, Table  # noqa: E402
 
 HERE = Path(__file__).parent
