@@ -28,7 +28,7 @@ def test_nan_in_the_loss_stops(method, monkeypatch):
             image.fill_(float("nan")) if hasattr(image, "fill_") else image.fill(np.nan)
         return image
 
-    for module in (problem_module, import_module("warpfrag.render")):
+    for module in (problem_module, import_module("warpfrag.renderer")):
         monkeypatch.setattr(module, "composite", poisoned)
     with pytest.raises(FitError, match=r"step \d+: the loss is nan at beta 0\.\d+, red\.thickness"):
         fit(make_study(method=method))

@@ -155,7 +155,7 @@ MISTAKES = [
     ("scene.toml", "other.toml", "scene: got no such file at"),
     ("scene = ", 'loss = "l3"\nscene = ', 'loss: got "l3", expected one of "l2", "l1", "huber"'),
     ("scene = ", 'method = "newton"\nscene = ', 'method: got "newton"'),
-    ("scene = ", "steps = 0\nscene = ", "steps: got 0, expected a whole number of at least 1"),
+    ("scene = ", "steps = 0\nscene = ", "steps: got 0, expected a whole number from 1 to 1000000000"),
     ("scene = ", "steps = 1.5\nscene = ", "steps: got 1.5"),
     ("scene = ", "size = [0, 4]\nscene = ", "size: got [0, 4]"),
     ("scene = ", "tolerance = -1\nscene = ", "tolerance: got -1"),
