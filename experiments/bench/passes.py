@@ -28,13 +28,13 @@ import warpfrag as wf  # noqa: E402
 SCENE = Path(__file__).parents[2] / "scenes" / "bunny_in_sphere.toml"
 # The functions of each pass: the module that calls them, and their name there.
 PASSES = {
-    "assemble": (("warpfrag.render", "surfaces_of"),),
+    "assemble": (("warpfrag.renderer", "surfaces_of"),),
     "triangles": (("warpfrag.capture.surfaces", "prepare_triangles"),),
-    "count": (("warpfrag.render", "count_fragments"),),
+    "count": (("warpfrag.renderer", "count_fragments"),),
     "scan + store": (("warpfrag.capture.coverage", "fill"),),
     "sort": (("warpfrag.capture.coverage", "sort_lists"),),
     "shade": (("warpfrag.capture.coverage", "apply"),),
-    "resolve + composite": (("warpfrag.render", "composite"),),
+    "resolve + composite": (("warpfrag.renderer", "composite"),),
 }
 NOT_PIXELS = ("assemble", "rest", "all")
 
