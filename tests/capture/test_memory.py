@@ -67,6 +67,7 @@ def test_default_limit_is_half_of_the_free_memory(monkeypatch):
 
 
 @pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="Linux tells the peak of a process's memory")
+@pytest.mark.slow
 def test_images_and_their_gradients_keep_to_the_limit():
     """A process grows by no more than the limit, whether an image is differentiated or not; without it, by more."""
     script = """

@@ -214,6 +214,7 @@ def wait_for(path: Path, process: subprocess.Popen, newer_than: float = 0.0) -> 
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals are those of POSIX")
+@pytest.mark.slow
 def test_interrupted_and_killed_fit_ends_at_the_same_bits(folder):
     """After Ctrl-C, then kill -9, a resumed fit ends where an unbroken one does; Ctrl-C says how to go on."""
     text = STUDY.replace("steps = 60", "steps = 2000\ntolerance = 0")

@@ -56,7 +56,7 @@ thickness = 0.2
 """
 
 
-@pytest.mark.parametrize("method", ["adam", "least_squares"])
+@pytest.mark.parametrize("method", [pytest.param("adam", marks=pytest.mark.slow), "least_squares"])
 def test_two_processes_find_what_one_does(tmp_path, method):
     """Started by torchrun, two processes share the views and end where one does, to rounding; one of them writes."""
     (tmp_path / "scene.toml").write_text(SCENE)
