@@ -84,21 +84,29 @@ def store_gradient(g: Any, lists: Any, fragment: int, grads: Any):
     g_opacity = g.opacity - g.transmittance
     if transmittance > zero:
         g_opacity -= g.log_transmittance / transmittance
+    g_sum = zero
     if lists.opacity_sum.shape[0] > 0:
         # The weight is S/A, up to its limit.
-        g_sum = zero
         if divide(lists.opacity_sum[fragment], opacity, zero) < type(opacity)(WEIGHT_LIMIT):
             g_sum = divide(g.weight, opacity, zero)
             g_opacity -= divide(g_sum * lists.opacity_sum[fragment], opacity, zero)
-        if grads.opacity_sum.shape[0] > 0:
-            grads.opacity_sum[fragment] = finite(g_sum)
+    rgba = wp.vector(g.color[0], g.color[1], g.color[2], g_opacity)
+    back = g.back
+    thickness = g.thickness
+    # One question for all: their sum is finite only if each of them is.
+    if not wp.isfinite(rgba[0] + rgba[1] + rgba[2] + rgba[3] + back + thickness + g_sum):
+        rgba = wp.vector(finite(rgba[0]), finite(rgba[1]), finite(rgba[2]), finite(rgba[3]))
+        back = finite(back)
+        thickness = finite(thickness)
+        g_sum = finite(g_sum)
+    if grads.opacity_sum.shape[0] > 0:
+        grads.opacity_sum[fragment] = g_sum
     if grads.rgba.shape[0] > 0:
-        color = wp.vector(finite(g.color[0]), finite(g.color[1]), finite(g.color[2]))
-        grads.rgba[fragment] = wp.vector(color[0], color[1], color[2], finite(g_opacity))
+        grads.rgba[fragment] = rgba
     if grads.depth.shape[0] > 0:
-        grads.depth[fragment] = finite(g.back)
+        grads.depth[fragment] = back
     if grads.thickness.shape[0] > 0:
-        grads.thickness[fragment] = finite(g.thickness)
+        grads.thickness[fragment] = thickness
 
 
 @wp.func(inline=True)
