@@ -86,10 +86,11 @@ def store_gradient(g: Any, lists: Any, fragment: int, grads: Any):
         g_opacity -= g.log_transmittance / transmittance
     g_sum = zero
     if lists.opacity_sum.shape[0] > 0:
+        opacity_sum = lists.opacity_sum[fragment]
         # The weight is S/A, up to its limit.
-        if divide(lists.opacity_sum[fragment], opacity, zero) < type(opacity)(WEIGHT_LIMIT):
+        if divide(opacity_sum, opacity, zero) < type(opacity)(WEIGHT_LIMIT):
             g_sum = divide(g.weight, opacity, zero)
-            g_opacity -= divide(g_sum * lists.opacity_sum[fragment], opacity, zero)
+            g_opacity -= divide(g_sum * opacity_sum, opacity, zero)
     rgba = wp.vector(g.color[0], g.color[1], g.color[2], g_opacity)
     back = g.back
     thickness = g.thickness
