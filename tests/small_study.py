@@ -16,6 +16,50 @@ EVERYTHING = {
     "blue.opacity": 0.5,
 }
 
+# A study file of three views, its batch to be filled in, and the scene file that it names.
+VIEWS_STUDY = """
+scene = "scene.toml"
+method = "adam"
+steps = 12
+batch = {batch}
+[reference]
+true = {{a.opacity = 0.4}}
+[parameters]
+a.opacity = 0.8
+b.thickness = {{start = 0.3, lower = 0.05, upper = 1.0}}
+beta = 0.9
+[[view]]
+name = "front"
+[[view]]
+name = "left"
+eye = [-2.0, 0.3, 1.5]
+[[view]]
+name = "right"
+eye = [2.0, 0.3, 1.5]
+"""
+VIEWS_SCENE = """
+beta = 0.5
+[camera]
+eye = [0.0, 0.0, 3.0]
+target = [0.0, 0.0, 0.0]
+fov = 40.0
+near = 0.1
+far = 10.0
+size = [32, 24]
+[[object]]
+name = "a"
+primitive = "sphere"
+radius = 0.5
+opacity = 0.6
+thickness = 0.2
+[[object]]
+name = "b"
+primitive = "cube"
+scale = [0.8, 0.3, 0.7]
+opacity = 0.5
+thickness = 0.2
+"""
+
 
 def make_study(parameters: Any = None, *, true: Any = None, scene: Scene | None = None, **options: Any) -> Study:
     """Return a study of the small scene against its own render."""

@@ -7,60 +7,16 @@ import sys
 
 import numpy as np
 import pytest
+from small_study import VIEWS_SCENE, VIEWS_STUDY
 
 from warpfrag.fit import fit
-
-STUDY = """
-scene = "scene.toml"
-method = "adam"
-steps = 12
-batch = {batch}
-[reference]
-true = {{a.opacity = 0.4}}
-[parameters]
-a.opacity = 0.8
-b.thickness = {{start = 0.3, lower = 0.05, upper = 1.0}}
-beta = 0.9
-[[view]]
-name = "front"
-[[view]]
-name = "left"
-eye = [-2.0, 0.3, 1.5]
-[[view]]
-name = "right"
-eye = [2.0, 0.3, 1.5]
-"""
-
-
-SCENE = """
-beta = 0.5
-[camera]
-eye = [0.0, 0.0, 3.0]
-target = [0.0, 0.0, 0.0]
-fov = 40.0
-near = 0.1
-far = 10.0
-size = [32, 24]
-[[object]]
-name = "a"
-primitive = "sphere"
-radius = 0.5
-opacity = 0.6
-thickness = 0.2
-[[object]]
-name = "b"
-primitive = "cube"
-scale = [0.8, 0.3, 0.7]
-opacity = 0.5
-thickness = 0.2
-"""
 
 
 @pytest.mark.parametrize("method", [pytest.param("adam", marks=pytest.mark.slow), "least_squares"])
 def test_two_processes_find_what_one_does(tmp_path, method):
     """Started by torchrun, two processes share the views and end where one does, to rounding; one of them writes."""
-    (tmp_path / "scene.toml").write_text(SCENE)
-    text = STUDY.format(batch=2)
+    (tmp_path / "scene.toml").write_text(VIEWS_SCENE)
+    text = VIEWS_STUDY.format(batch=2)
     if method == "least_squares":
         text = text.replace("batch = 2", "").replace('"adam"', '"least_squares"')
     (tmp_path / "study.toml").write_text(text)

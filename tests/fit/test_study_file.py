@@ -5,55 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from small_scene import SCENE
+from small_study import VIEWS_SCENE, VIEWS_STUDY
 
 from warpfrag.errors import SceneError
 from warpfrag.files.images import ImageError, write_image
 from warpfrag.fit import FitParameter, Study, StudyError, load_study
-
-VIEWS_STUDY = """
-scene = "scene.toml"
-method = "adam"
-steps = 12
-batch = {batch}
-[reference]
-true = {{a.opacity = 0.4}}
-[parameters]
-a.opacity = 0.8
-b.thickness = {{start = 0.3, lower = 0.05, upper = 1.0}}
-beta = 0.9
-[[view]]
-name = "front"
-[[view]]
-name = "left"
-eye = [-2.0, 0.3, 1.5]
-[[view]]
-name = "right"
-eye = [2.0, 0.3, 1.5]
-"""
-
-
-VIEWS_SCENE = """
-beta = 0.5
-[camera]
-eye = [0.0, 0.0, 3.0]
-target = [0.0, 0.0, 0.0]
-fov = 40.0
-near = 0.1
-far = 10.0
-size = [32, 24]
-[[object]]
-name = "a"
-primitive = "sphere"
-radius = 0.5
-opacity = 0.6
-thickness = 0.2
-[[object]]
-name = "b"
-primitive = "cube"
-scale = [0.8, 0.3, 0.7]
-opacity = 0.5
-thickness = 0.2
-"""
 
 
 def test_views_from_a_file(tmp_path):
